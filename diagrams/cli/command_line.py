@@ -67,10 +67,7 @@ _SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit status.
-
-    ``argv``: the arguments; those of the process without it.
-    """
+    """Run the command line with arguments, those of the process without them, and return the exit status."""
     parser = _make_parser()
     try:
         check_command(parser, sys.argv[1:] if argv is None else argv, [*_commands(parser)])
@@ -286,10 +283,7 @@ def _simulate(experiment: Experiment) -> tuple[Run | None, str | None, bool]:
 def _write(
     experiment: Experiment, run: Run, problem: str | None, folder: Path
 ) -> tuple[dict[str, float | None], list[str]]:
-    """Write all files of a run; return its key numbers and the files' names.
-
-    They take the place of older ones all together, at the end; if one can't be written, the older ones stay.
-    """
+    """Write all files of a run, in place of older ones all at once; return its key numbers and the files' names."""
     from ..paper import plot_experiment, plot_path
     from ..plotting import save
 

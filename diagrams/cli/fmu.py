@@ -223,19 +223,19 @@ def _find_model(arguments: argparse.Namespace) -> Iterator[Make]:
         with load_user_model(text) as model:
             is_block = isinstance(model.block, Block)
             name = type(model.block).__name__.lower() if is_block else name_of(model.block, arguments.subsystem)
-            yield _make_builder(model.block, arguments.python, build_model, name, model.beside)
+            yield _make_builder(model.block, arguments.python, build_model, name, model.imported)
     else:
         hint = near(text, plants())  # names all of them where none is close
         known = f" The plants: {', '.join(plants())}." if close_names(text, plants()) else ""
         raise OptionError(f"there is no model {text!r}. {hint}{known} A model of yours is FILE.py:Name.", port="MODEL")
 
 
-def _make_builder(block: Any, python: bool, build: Callable[..., Path], name: str, beside: Iterable[Path] = ()) -> Make:
+def _make_builder(block: Any, python: bool, build: Callable[..., Path], name: str, files: Iterable[Path] = ()) -> Make:
     def make(options: dict[str, Any], file: Path | None, folder: Path) -> Path:
         chosen = {"name": name, **options}
         target = file or folder / f"{chosen['name']}.fmu"
         if python:
-            return build_python(block, target, files=beside, notify=_progress, **chosen)
+            return build_python(block, target, files=files, notify=_progress, **chosen)
         _progress(f"tracing {chosen['name']}")
         return build(block, target, notify=_progress, **chosen)
 

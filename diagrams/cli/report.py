@@ -200,7 +200,7 @@ def report_command(arguments: argparse.Namespace) -> int:
 
 
 def _read_worst_case(given: str | None, file: TomlFile | None) -> WorstCaseTask | None:
-    """Return the worst case that a file of its own asks for, or that of the requirements."""
+    """Return the worst case that the file of the option asks for, or that of the requirements."""
     from ..studies import WorstCaseTask
 
     own = _read_study(given, file, KEY, "--worst-case")
@@ -208,7 +208,7 @@ def _read_worst_case(given: str | None, file: TomlFile | None) -> WorstCaseTask 
 
 
 def _read_contacts(given: str | None, file: TomlFile | None) -> ContactTask | None:
-    """Return the contacts that a file of their own asks for, or those of the requirements."""
+    """Return the contacts that the file of the option asks for, or those of the requirements."""
     from ..studies import ContactTask
 
     own = _read_study(given, file, CONTACT, "--contact")

@@ -41,7 +41,7 @@ def is_user_file(subject: str) -> bool:
 
 
 def is_ssp(subject: str) -> bool:
-    """Return whether a subject names an SSP, or a description that is a file of its own."""
+    """Return whether a subject names an SSP, or a separate description (.ssd)."""
     return _SSP.fullmatch(subject) is not None
 
 
@@ -62,12 +62,7 @@ def proposed(subject: str) -> dict[str, float]:
 
 @contextlib.contextmanager
 def open_user_diagram(subject: str) -> Iterator[tuple[Diagram, Experiment | None]]:
-    """Yield the diagram of ``FILE.py:NAME`` or ``FILE.ssp``, and its experiment where it has one.
-
-    Raises `OptionError`: no such file or name, or a name that is no diagram.
-    Raises `DefinitionError`: the file, or the function that makes the diagram, raises: with the line in the user's
-    file.
-    """
+    """Yield the diagram of ``FILE.py:NAME`` or ``FILE.ssp``, and its experiment where it has one."""
     if is_ssp(subject):
         yield Diagram.from_ssp(*split_ssp(subject)), None
         return
@@ -90,7 +85,7 @@ def _make_experiment(name: str, arguments: argparse.Namespace) -> Experiment:
 
 
 def find_diagram(names: Mapping[str, object], path: Path, name: str) -> Diagram | Experiment:
-    """Return the diagram or experiment that a name stands for in a user's file."""
+    """Return the diagram or experiment that a name means in a user's file."""
     source, file = str(path), path.name
     known = {key: value for key, value in names.items() if isinstance(value, Diagram | Experiment)}
     if not name:

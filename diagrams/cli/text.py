@@ -60,10 +60,7 @@ def fit(text: str, stream: IO[str]) -> str:
 
 
 def check_file(name: str) -> Path:
-    """Return the path of an FMU that is named on the command line.
-
-    Raises `OptionError` if there is no such file.
-    """
+    """Return the path of an FMU that is named on the command line; OptionError: there is no such file."""
     path = Path(name).expanduser()
     with explain_disk_errors("it can't be read", path, "Give another file.", OptionError, block=str(path)):
         is_file = path.is_file()

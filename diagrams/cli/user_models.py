@@ -19,22 +19,15 @@ _MODULE = "loopwright_user_model"
 
 @dataclass(frozen=True)
 class UserModel:
-    """A block, a diagram or a subsystem in a user's file.
-
-    ``beside``: the modules next to the file that it has imported: files, or folders of packages.
-    """
+    """A block, a diagram or a subsystem in a user's file."""
 
     block: Block | Diagram | Subsystem
-    beside: tuple[Path, ...]
+    imported: tuple[Path, ...]  # modules next to the file that it has imported: files, or folders of packages
 
 
 @contextlib.contextmanager
 def load_user_model(text: str) -> Iterator[UserModel]:
-    """Load a model from ``FILE.py:Name``; its module, and those next to it that it imports, are forgotten afterwards.
-
-    Raises `OptionError`: no such file, no such name, a name that is no block, or a class that needs parameters.
-    Raises `DefinitionError`: the file can't be imported, or the class can't be made.
-    """
+    """Load a model from ``FILE.py:Name``; its module, and those next to it that it imports, are forgotten then."""
     path, name = _split_name(text)
     with _load(path) as module:
         block = _find_block(module, path, name)
@@ -45,11 +38,7 @@ def load_user_model(text: str) -> Iterator[UserModel]:
 
 @contextlib.contextmanager
 def load_user_file(text: str, *, port: str) -> Iterator[tuple[ModuleType, Path, str]]:
-    """Load a file from ``FILE.py:NAME``, or ``FILE.py``; yield its module, its path, and the name or "".
-
-    Raises `OptionError`: no such file.
-    Raises `DefinitionError`: the file can't be imported.
-    """
+    """Load a file from ``FILE.py:NAME``, or ``FILE.py``; yield its module, its path, and the name or ""."""
     path, name = _split_name(text, port, "loop.py:diagram")
     with _load(path) as module:
         yield module, path, name

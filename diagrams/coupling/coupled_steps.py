@@ -37,23 +37,18 @@ class Effort:
 
 
 class CoupledSteps:
-    """Communication steps of all plants of a run, by a scheme other than the default.
-
-    ``plants``: the plants by path; it may be filled later.
-    ``z``, ``w``: inputs and outputs of the plants in the run.
-    ``exchange``: gives the inputs that follow from w at a time in s, between ticks.
-    """
+    """Communication steps of all plants of a run, by a scheme other than the default."""
 
     def __init__(
         self,
         flat: FlatDiagram,
         name: str,
-        plants: Mapping[str, Plant],
+        plants: Mapping[str, Plant],  # may be filled later
         coupling: Coupling,
         steps: PlantSteps,
         z: np.ndarray,
         w: np.ndarray,
-        exchange: Callable[[float], np.ndarray],
+        exchange: Callable[[float], np.ndarray],  # gives the inputs that follow from w at a time in s, between ticks
         rest: Rest,
     ) -> None:
         self._flat, self._name, self._plants, self.coupling = flat, name, plants, coupling
@@ -124,12 +119,7 @@ class CoupledSteps:
     # --- from tick to tick --------------------------------------------------------------------------------------------
 
     def go(self, t: float, end: float, h: float) -> float | None:
-        """Go from one tick to the next.
-
-        ``t``, ``end``: times of the ticks in s.
-        ``h``: length of the step between them in s, rounded once.
-        Returns: time in s at which a stop condition has ended the run before the next tick.
-        """
+        """Go from one tick to the next; return the time in s at which a stop condition ended the run before that."""
         if self.coupling.error is not None or self.coupling.scheme == Scheme.ITERATED:
             try_steps(self._plants.values())
             if self._untried:
@@ -204,11 +194,9 @@ class CoupledSteps:
         )
 
     def _pass_over(self, t: float, end: float, h: float, inputs: np.ndarray, start: Beginning) -> None:
-        """Step all plants with the inputs that follow from w at the end of the step.
-
-        The states come of the mean of the inputs at the beginning and at the end: held over the step, it has their
-        integral. Outputs that follow an input at once come of their own step, with the input at the end.
-        """
+        """Step all plants with the inputs that follow from w at the end of the step."""
+        # The states come of the mean of the inputs at the beginning and at the end: held over the step, it has their
+        # integral. Outputs that follow an input at once come of a step with the input at the end.
         links = self.links
         last = np.where(links.moving & links.smooth_inputs, self._exchange(left_of(end)), inputs)
         made = {}
@@ -356,7 +344,7 @@ class CoupledSteps:
 
 
 def passes_slopes(block: Any) -> bool:
-    """Whether a run tells a plant the slopes of its inputs."""
+    """Whether a run gives a plant the slopes of its inputs."""
     return bool(getattr(getattr(block, "stepping", None), "input_derivatives", False))
 
 

@@ -71,12 +71,8 @@ class _Counted:
 
 
 def find_fixed_point(function: Function, guess: np.ndarray, most: int | None = None) -> np.ndarray | None:
-    """Return values that a function returns unchanged, to rounding; None where none are found.
-
-    ``function``: of a vector; NaN or infinite where it has no value.
-    ``guess``: first guess, at which the function has a value.
-    ``most``: most evaluations of the function; 500, and 100 for each unknown, without it.
-    """
+    """Return values that a function returns unchanged, to rounding; None where none are found."""
+    # At the guess the function must have a value; elsewhere it may be NaN or infinite.
     start = np.array(guess, dtype=float)
     counted = _Counted(function, 500 + 100 * len(start) if most is None else most)
     try:

@@ -17,12 +17,9 @@ from .plants import part_of
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Links between the plants of a diagram: entries of their inputs z and of their outputs w.
+    """Links between the plants of a diagram: entries of their inputs z and of their outputs w."""
 
-    Signals that sampled subsystems make are held between ticks, and make no link.
-    """
-
-    flat: FlatDiagram
+    flat: FlatDiagram  # signals that its sampled subsystems make are held between ticks, and make no link
 
     @cached_property
     def paths(self) -> tuple[str, ...]:
@@ -143,11 +140,7 @@ class Links:
     # --- order and loops ----------------------------------------------------------------------------------------------
 
     def order(self, wanted: Sequence[str]) -> tuple[str, ...]:
-        """Return the order in which the plants step one after the other.
-
-        Without a wanted order the next one is always the plant that waits for the fewest others: first by inputs that
-        it passes straight on, then by all its inputs, then by its path.
-        """
+        """Return the order in which the plants step one after the other: the one wanted, or by feedthrough."""
         if wanted:
             for path in wanted:
                 if path not in self.paths:
@@ -158,6 +151,7 @@ class Links:
                 )
             return tuple(wanted)
         straight = np.atleast_1d(self.direct.any(axis=0))
+        # Next is the plant that waits for the fewest others: by inputs that it passes straight on, by all, by path.
         rest, found = [*self.paths], list[str]()
 
         def waits(path: str) -> tuple[int, int, str]:
@@ -173,10 +167,8 @@ class Links:
         return tuple(found)
 
     def renewed_inputs(self, order: Sequence[str]) -> dict[str, np.ndarray]:
-        """Return for each plant the inputs that are renewed before it steps, where one steps after the other.
-
-        These follow outputs of the plants before it, or states of blocks, which have continued already.
-        """
+        """Return for each plant the inputs that are renewed before it steps, where one steps after the other."""
+        # These follow outputs of the plants before it, or states of blocks, which have continued already.
         before = np.zeros(self.flat.plant_outputs.total, dtype=bool)
         found = {}
         for path in order:
@@ -220,10 +212,8 @@ class Links:
 
 
 def direct_ports(flat: FlatDiagram, *, wired: bool = False) -> set[tuple[str, str, str]]:
-    """Return the plants with an input and an output that may follow it at once; a plant that doesn't say so may.
-
-    ``wired``: whether only outputs that something is wired to are looked at.
-    """
+    """Return the plants with an input and an output that may follow it at once; a plant that doesn't say so may."""
+    # ``wired``: only outputs that something is wired to.
     found, used = set(), {(wire.block, wire.port) for wire in flat.table.wires.values()}
     for path, block in stepped_blocks(flat.table).items():
         plant: Any = block

@@ -13,22 +13,12 @@ from .plants import Plant, bind, part_of
 
 
 class PlantSteps:
-    """The plants of a run with their ticks, and the inputs that they hold between them.
-
-    ``plants``: the plants by path; it may be filled later.
-    ``z``, ``w``: inputs of the plants, as the diagram has computed them, and their outputs.
-    ``time_of``: gives the time of a tick in s.
-    ``every_tick``: whether the run visits every tick.
-    ``regular``: whether every plant steps at every tick that the run visits. Then inputs are read from z itself.
-    ``z``: inputs of the plants, as the diagram has computed them last.
-    ``inputs``: inputs of the plants, each as of its last communication point.
-    ``own``: the inputs of each plant among them, as a slice, by path.
-    """
+    """The plants of a run with their ticks, and the inputs that they hold between them."""
 
     def __init__(
         self,
         flat: FlatDiagram,
-        plants: Mapping[str, Plant],
+        plants: Mapping[str, Plant],  # may be filled later
         z: np.ndarray,
         w: np.ndarray,
         time_of: Callable[[int], float],
@@ -37,12 +27,14 @@ class PlantSteps:
         coupled: bool = False,
     ) -> None:
         self._flat, self._plants, self._time_of = flat, plants, time_of
-        self.z, self._w = z, w
+        self.z, self._w = z, w  # z: inputs, as the diagram has computed them last
         self._visited = {EVERY} if every_tick else {*flat.visited}
         self.regular = all(map(self.is_regular, flat.plant_ticks))
+        """Whether every plant steps at every tick that the run visits; then inputs are read from z itself."""
         moves = flat.hybrid and bool(flat.plant_ticks) and not coupled  # z follows states between ticks
         self.inputs = z.copy() if moves or not self.regular else z
-        self.reached: dict[str, int] = {}
+        """Inputs of the plants, each as of its last communication point."""
+        self.reached: dict[str, int] = {}  # tick at which each plant is
         self._even = {path for path in flat.plant_ticks if not takes_any_step(flat.table.blocks[path])}
         self.own = {path: part_of(flat, flat.plant_inputs, path) for path in flat.plant_ticks}
 
@@ -66,11 +58,8 @@ class PlantSteps:
         self.reached = dict.fromkeys(self._plants, k)
 
     def go(self, k: int, following: int, *, last: bool) -> None:
-        """Step the plants from a tick that the run has visited to the next one; at the ``last`` tick all that can.
-
-        Those step of which the tick is a communication point, each from its last one. A plant that stops on its way, at
-        the end of a run, continues from there with the inputs that it holds.
-        """
+        """Step the plants from a tick that the run has visited to the next one; at the ``last`` tick all that can."""
+        # A plant that stops on its way, at the end of a run, continues from there with the inputs that it holds.
         due = self.due(k, following, last=last)
         if self.apart:
             step_each((self._plants[path], *step) for path, step in due.items())
@@ -94,10 +83,7 @@ class PlantSteps:
         return self._flat.steps_at(path, k) or (last and path not in self._even)
 
     def table(self, ticks: np.ndarray, last: int) -> StepTable | None:
-        """Return the steps to ticks that are visited from here on, of which ``last`` ends the run; None: all whole.
-
-        Times and lengths are those of `go` to the last bit.
-        """
+        """Return the steps to ticks that are visited from here on, to the bits of `go`; None: all step at each."""
         if self.regular:
             return None
         shape = len(ticks), len(self._plants)
@@ -160,11 +146,9 @@ def asks_to_end(error: SimulationError) -> bool:
 
 
 def step_all(plants: Iterable[Plant], t: float, h: float) -> None:
-    """Let plants step from t over h, both in s; those in their own processes step at the same time.
-
-    Every step that has begun is ended, also where one fails; then the first error is raised, and a plant's request to
-    end the run only where nothing else has failed.
-    """
+    """Let plants step from t over h, both in s; those in their own processes step at the same time."""
+    # Every step that has begun is ended, also where one fails; then the first error is raised, and a plant's request to
+    # end the run only where nothing else has failed.
     step_each((plant, t, h) for plant in plants)
 
 
@@ -187,10 +171,7 @@ def step_each(steps: Iterable[tuple[Plant, float, float]]) -> None:
 
 
 def end_all(ends: Iterable[Callable[[], None]], failure: SimulationError | None = None) -> None:
-    """End steps that have begun, each of them; then raise an error, by the rule of `step_all`.
-
-    ``failure``: error with which one could not begin.
-    """
+    """End all steps that have begun; then raise ``failure``, or the first error, by the rule of `step_all`."""
     for end in ends:
         try:
             end()

@@ -80,7 +80,7 @@ def note_steps(flat: FlatDiagram, *, step: object) -> tuple[str, ...]:
 
 
 _KNOWN: WeakKeyDictionary[FlatDiagram, dict[bool, tuple[str, ...]]] = WeakKeyDictionary()
-"""The messages on diagrams that have run, by whether a run has no step of its own: each run has the same."""
+"""The messages on diagrams that have run, by whether no step was asked for: each run has the same."""
 
 
 def _note_fine_steps(flat: FlatDiagram) -> tuple[str, ...]:
@@ -118,10 +118,8 @@ def _note_parts_of_steps(flat: FlatDiagram) -> tuple[str, ...]:
 
 
 def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Plant]]:
-    """Yield the plants by path, each as soon as it is loaded; ``stack`` unloads them.
-
-    They are told no end of the run: it may be continued, and an FMU may keep to the end that it was told.
-    """
+    """Yield the plants by path, each as soon as it is loaded; ``stack`` unloads them."""
+    # No end of the run is passed: it may be continued, and an FMU may keep to the end that it was given.
     for path, block in stepped_blocks(flat.table).items():
         made: Any = block
         stepped: Stepped = made

@@ -17,11 +17,10 @@ ROUNDING = 1e-9
 
 
 class Rollback:
-    """Compare outputs after a step was taken back with those at its beginning.
+    """Compares outputs after a step was taken back with those at its beginning."""
 
-    Both are read after a restore, so that an FMU which computes its outputs again then is compared with itself. An
-    output is compared until it has moved in a step and come back once.
-    """
+    # Both are read after a restore, so that an FMU which computes its outputs again then is compared with itself. An
+    # output is compared until it has moved in a step and come back once.
 
     def __init__(self, links: Links, w: np.ndarray) -> None:
         self._links, self._w = links, w
@@ -33,12 +32,7 @@ class Rollback:
         return bool(self._open.any())
 
     def check(self, path: str, stepped: np.ndarray, begun: np.ndarray, t: float | None) -> None:
-        """Compare the outputs of a plant that has just been restored.
-
-        ``stepped``: its outputs before it was restored.
-        ``begun``: outputs of all plants, read after a restore at the beginning of the step.
-        ``t``: time of the state in s.
-        """
+        """Compare the outputs of a plant that has just been restored."""
         mine = self._links.outputs[path]
         found, expected = self._w[mine], begun[mine]
         allowed = ROUNDING * (self._links.nominals[mine] + np.abs(expected))
@@ -64,16 +58,10 @@ TAKEN_BACK = 1e-3
 
 
 def find_taken_back(links: Links, paths: Iterable[str], made: Sequence[np.ndarray], t: float) -> set[str]:
-    """Return the plants that have moved in a whole step; refuse those that take back the first of two halves.
-
-    A step behind a state that may be restored is not said to be final (noSetFMUStatePriorToCurrentPoint = false). There
-    are FMUs that go back to its beginning when the next one begins, although nothing has restored their state.
-
-    ``paths``: plants that were tried, from one state and with the same inputs.
-    ``made``: outputs of all plants after half a step, after two halves, and after a whole step.
-    ``t``: time in s at which these begin.
-    """
-    moved, (half, halves, whole) = set(), made
+    """Return the plants that have moved in a whole step; refuse those that take back the first of two halves."""
+    # A step behind a state that may be restored is not said to be final (noSetFMUStatePriorToCurrentPoint = false).
+    # There are FMUs that go back to its beginning when the next one begins, although nothing has restored their state.
+    moved, (half, halves, whole) = set(), made  # outputs of all plants after half a step, two halves, a whole step
     for path in paths:
         mine = links.outputs[path]
         change = np.abs(whole[mine] - half[mine])
@@ -117,12 +105,9 @@ def save_plant(plant: Plant) -> Any:
 
 
 def try_steps(plants: Iterable[Any]) -> None:
-    """Tell plants that the next steps may be taken back, so that a value of an input is not refused before it counts.
-
-    A plant that refuses none has no ``is_trial``.
-    """
+    """Let inputs out of their range be kept, and no error yet, as the next steps may be taken back."""
     for plant in plants:
-        if hasattr(plant, "is_trial"):
+        if hasattr(plant, "is_trial"):  # one that refuses no value has none
             plant.is_trial = True
 
 

@@ -16,14 +16,12 @@ _SETTLED = 1e-13  # relative change of a state between two passes at the start, 
 
 
 class BlocksInModelExchange:
-    """All blocks of a run in model exchange, with their events.
-
-    ``evaluators``: their evaluators, by path; they are there before the blocks are loaded.
-    """
+    """All blocks of a run in model exchange, with their events."""
 
     def __init__(self, flat: FlatDiagram):
         self.flat = flat
         self.evaluators = {path: ModelExchangeEvaluator(flat, path) for path in flat.in_model_exchange}
+        """Their evaluators, by path; they are there before the blocks are loaded."""
         self.blocks: dict[str, ModelExchangeBlock] = {}
         """The blocks that are loaded, by path."""
 
@@ -49,12 +47,9 @@ class BlocksInModelExchange:
     # --- the start ---------------------------------------------------------------------------------------------------
 
     def exchange(self, x: np.ndarray, look: Callable[[], None]) -> str:
-        """Set the inputs of all blocks, and write the states that follow into x.
-
-        Returns: path of a block whose states or inputs have changed; empty without one.
-        """
+        """Set the inputs of all blocks, and write the states that follow into x; return the path of one that moved."""
         moved, before = "", {path: e.u for path, e in self.evaluators.items()}
-        look()
+        look()  # evaluates `JUMP`, which brings the inputs
         for path, e in self.evaluators.items():
             where = self.flat.states.slices[path]
             states = e.block.exchange(e.u)

@@ -154,10 +154,7 @@ class ModelExchangeEvaluator:
         self._loaded = block
 
     def look_at(self, call: Callable[[], None], *, completes_step: bool) -> str | None:
-        """Look at an instant that is reached, and return the name of the event that has acted, if any: see `event`.
-
-        ``completes_step``: whether the solver has accepted a step that ends there; else events may act.
-        """
+        """Look at an instant that is reached, by a bound call; return the name of the event that acts, see `event`."""
         self.look, self.event = Look.STEP if completes_step else Look.EVENTS, None
         call()
         return self.event
@@ -182,11 +179,8 @@ class ModelExchangeEvaluator:
         return wanted
 
     def _jump(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Look at an instant that is reached: let events act, or take note of a step that the solver has accepted.
-
-        Behind the inputs is 1 for each event that fires.
-        """
-        n = u.size - self._count
+        """Look at an instant that is reached: let events act, or take note of a step that the solver has accepted."""
+        n = u.size - self._count  # behind the inputs is 1 for each event that fires
         u, fired = u[:n], u[n:]
         self.u = u.copy()
         block = self.block
@@ -209,12 +203,10 @@ class ModelExchangeEvaluator:
         return block.handle_event(t, x, u)
 
     def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the derivative of `evaluate` by (t, x, u), NaN by t; None: by differences.
-
-        Differences are by states and inputs alone: time can't go back behind an event.
-        """
+        """Return the derivative of `evaluate` by (t, x, u), NaN by t; None: by differences."""
         if not {NEXT, GUARDS, *self._outputs}.issuperset(names):
             return None
+        # Differences are by states and inputs alone: time can't go back behind an event.
         wanted = sort_names(names)
         J = self.slopes(wanted.outputs, rates=wanted.rates, t=t, x=x, u=u)
         if J is None:
@@ -228,10 +220,7 @@ class ModelExchangeEvaluator:
     def differences(
         self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray, scale: float = 1.0
     ) -> np.ndarray:
-        """Return the derivative of `evaluate` by (x, u), by central differences over parts of the nominal values.
-
-        ``scale`` makes the differences longer.
-        """
+        """Return the derivative of `evaluate` by (x, u), by central differences over parts of the nominal values."""
         columns = []
         scales = [*self.block.nominals, *(0.0 for _ in u)]
         for i, (at, nominal) in enumerate(zip([*x, *u], scales, strict=True)):

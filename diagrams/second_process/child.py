@@ -15,11 +15,7 @@ Make = Callable[[str, Callable[[str], None]], object]
 
 @on_one_thread
 def main() -> None:
-    """Answer keys with parts until the host ends: ``("progress", text)``, then ``("made", bytes)``.
-
-    A part that fails, or can't be sent, is answered with ``("failed", None)``: the first process makes it itself, and
-    raises its error.
-    """
+    """Answer keys with parts until the host ends: ``("progress", text)``, then ``("made", bytes)``."""
     with contextlib.suppress(EOFError, BrokenPipeError):
         host = Host()
         data = host.receive()
@@ -31,7 +27,7 @@ def main() -> None:
                 made = pickle.dumps(make(key, lambda text: host.send(("progress", text))), protocol=5)
             except BrokenPipeError:
                 return
-            except Exception:
+            except Exception:  # it fails, or can't be sent: the first process makes it, and raises its error
                 host.send(("failed", None))
             else:
                 host.send(("made", made))

@@ -21,13 +21,10 @@ PAUSE = 0.1
 
 
 class SecondProcess(Generic[T]):
-    """A process that makes parts of a result; use it in a ``with`` statement.
+    """A process that makes parts of a result; use it in a ``with`` statement, whose end is its end."""
 
-    Every part is the same, whichever process makes it, and they are returned in their order. A part that the second
-    process can't make or send, or on which it ends, is made here. Its end is that of the ``with`` block.
-
-    ``make``: makes the parts there, see `Make`; it is pickled.
-    """
+    # Every part is the same, whichever process makes it. A part that the second process can't make or send, or on which
+    # it ends, is made here.
 
     def __init__(self, make: Make, name: str):
         self._child: PythonChild | None = None
@@ -63,13 +60,7 @@ class SecondProcess(Generic[T]):
         self._child.wait()
 
     def share(self, keys: Sequence[str], make: Callable[[str], T], report: Callable[[str], None]) -> list[T]:
-        """Return the parts of all keys: from the first one on made here, from the last one on in the second process.
-
-        The first one is always made here.
-
-        ``keys``: the keys, in the order of the result.
-        ``report``: called with what the second process reports, by this thread.
-        """
+        """Return the parts of all keys: from the first one on made here, from the last one on in the second process."""
         self._left = deque(keys[1:])
         if self._child is not None:
             self._thread = threading.Thread(target=self._go, args=[self._child], daemon=True)

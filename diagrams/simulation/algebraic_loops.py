@@ -1,4 +1,4 @@
-"""Algebraic loops, solved at an instant: Newton's method, and what tells that a solution is not the only one.
+"""Algebraic loops, solved at an instant: Newton's method, and signs that a solution is not the only one.
 
 The loops are the equations F(v) = v of the values v at their torn ports. J = ∂F/∂v − 1 is exact.
 """
@@ -31,22 +31,18 @@ _STARTS = (0.0, 1.0, -1.0, 10.0, -10.0, 0.1, -0.1, 100.0, -100.0)
 
 
 class LoopSolver:
-    """Solves the algebraic loops at the vectors that an evaluation of them is bound to.
-
-    ``t``, ``x``: the time, shape (1,), and x: v is sought in it, from the values there on.
-    ``call``: evaluates what comes round the loops less v, and J, into ``r`` and ``J``.
-    """
+    """Solves the algebraic loops at the vectors that an evaluation of them is bound to."""
 
     def __init__(
         self,
-        names: Sequence[str],
-        where: Sequence[int],
-        t: np.ndarray,
-        x: np.ndarray,
-        call: Callable[[], None],
+        names: Sequence[str],  # of each entry, such as "e.y"
+        where: Sequence[int],  # entries of x that hold v
+        t: np.ndarray,  # shape (1,)
+        x: np.ndarray,  # v is sought in it, from the values there on
+        call: Callable[[], None],  # evaluates what comes round the loops less v, and J, into r and J
         r: np.ndarray,
         J: np.ndarray,
-        loops: Sequence[str],
+        loops: Sequence[str],  # written port by port, for messages
     ):
         self.names, self.where, self.t, self.x, self.call, self.r = names, np.array(where), t, x, call, r
         n = len(names)
@@ -54,12 +50,9 @@ class LoopSolver:
         self.loops = loops
 
     def solve(self, *, search: bool = False) -> None:
-        """Solve them from the values in x on.
-
-        Newton's method with the exact derivative; a step that makes the residual larger is halved, and on, as long as
-        that helps. At the start, where no solution comes before, ``search`` begins from a few other values if that does
-        not lead to one; of the solutions that are found, the nearest to the values in x is taken.
-        """
+        """Solve them from the values in x on; at the start ``search`` begins from a few other values if that fails."""
+        # A step of Newton's method that makes the residual larger is halved, and on, as long as that helps. At the
+        # start no solution comes before; then the nearest one to the values in x is taken.
         before = self.x[self.where].copy()
         found = self._seek()
         if not found <= TOLERANCE and math.isfinite(found):  # a NaN that comes in is reported by who made it
@@ -148,10 +141,7 @@ class LoopSolver:
             self.call()
 
     def _search(self, around: np.ndarray, known: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return solutions that are found from a few values of the size of some values, without those that are known.
-
-        x is left at the last value that was tried.
-        """
+        """Return solutions found from a few values of the size of some values; x is left at the last try."""
         found: list[np.ndarray] = []
         alternating = np.where(np.arange(len(around)) % 2, -1.0, 1.0)
         patterns = [np.ones(len(around))] + ([alternating] if len(around) > 1 else [])
@@ -203,10 +193,7 @@ def _length(r: np.ndarray) -> float:
 
 
 def _eliminate(J: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return J⁻¹ r by Gaussian elimination, operation by operation as `newton.c` does it.
-
-    Raises `LinAlgError` if J is singular.
-    """
+    """Return J⁻¹ r by Gaussian elimination, as `newton.c` does it; LinAlgError: J is singular."""
     a, b = J.tolist(), r.tolist()
     n = len(b)
     for k in range(n):
@@ -258,10 +245,7 @@ def loop_solver(
 
 
 def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern], here: np.ndarray) -> NewtonOptions:
-    """Return Newton's method in C for the algebraic loops at a tick at which some clocks act.
-
-    ``here``: states of the instant that is reached, at which the loops have to determine their values.
-    """
+    """Return Newton's method in C for the algebraic loops at a tick; at the states ``here`` they must be determined."""
     from ..compiled import NewtonOptions
 
     def solver(

@@ -27,12 +27,9 @@ class ChangeOver:
         last: int,
         progress: Callable[[float], Any],
         make: Callable[[], LaterCode[Any]],
-        take_over: Callable[[], None],
+        take_over: Callable[[], None],  # called once the code is there
     ) -> Callable[[float], Any]:
-        """Return a ``progress`` for an interpreted run from here up to a tick, which has the code made in time.
-
-        ``make`` returns the code that is to be made; ``take_over`` is called once it is there.
-        """
+        """Return a ``progress`` for an interpreted run from here up to a tick, which has the code made in time."""
         started, before, first, end = perf_counter(), self._spent, self._position.t, self._position.time_of(last)
 
         def arrive(t: float) -> None:

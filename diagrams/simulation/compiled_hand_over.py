@@ -69,13 +69,10 @@ def bind_hybrid(
     stops: Sequence[int],
     methods: Sequence[MethodOptions],
     *,
-    rest: Callable[[], int],
-    drain: Callable[[], None],
+    rest: Callable[[], int],  # evaluates a tick for which there is no code; see `CompiledLoop`
+    drain: Callable[[], None],  # reports the events that have happened
 ) -> tuple[CompiledHybrid, HandedOver | None]:
-    """Return the loop in C, bound to the numbers of a run, and its blocks in model exchange.
-
-    ``rest``: evaluates a tick for which there is no code; see `CompiledLoop`.
-    """
+    """Return the loop in C, bound to the numbers of a run, and its blocks in model exchange."""
     flat, here, domains, blocks = workspace.flat, workspace.here, continuous.domains, continuous.exchanged
     # Blocks in model exchange and their own events come together, or neither is there.
     handed = (
@@ -112,11 +109,7 @@ def bind_hybrid(
 def accepts_of(
     workspace: Workspace, continuous: Continuous, *, judged: bool, plants: bool = False, exchanged: bool = False
 ) -> int:
-    """Return after which steps blocks are evaluated; see `CompiledHybrid`.
-
-    ``judged``: whether outputs may be non-finite while states are finite.
-    ``plants``, ``exchanged``: whether there are FMUs, and some in model exchange.
-    """
+    """Return after which steps blocks are evaluated, see `CompiledHybrid`; ``judged``: outputs may be non-finite."""
     flat, judged = workspace.flat, judged and not continuous.fixed
     always = plants or workspace.looped or remembers(flat) or has_guards(flat)
     return 1 if always or (judged and not exchanged) else 2 if judged else 0
@@ -149,10 +142,7 @@ def methods_of(continuous: Continuous) -> list[MethodOptions]:
 def find_edges(
     continuous: Continuous, t: float, end: float, *, limited: bool = True
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the discontinuities of sources from t on, up to the first one of each after the end; see `Span`.
-
-    ``limited``: return None if there are more than fit into a call.
-    """
+    """Return the discontinuities of sources from t to the first of each after the end; None if they are too many."""
     found = set[float]()
     for path, source in continuous.sources:
         edge = t
@@ -167,7 +157,7 @@ def find_edges(
 
 
 class EdgesAhead:
-    """Discontinuities of sources found once for a stretch of ticks, in however many calls C goes through it."""
+    """Discontinuities of sources, found once for a stretch of ticks, in however many calls C goes through it."""
 
     def __init__(self, continuous: Continuous):
         self._continuous = continuous

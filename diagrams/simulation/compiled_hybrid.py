@@ -48,23 +48,18 @@ from .workspace import Workspace
 
 
 class HybridTicks:
-    """The ticks of a run with continuous states, gone through in C.
-
-    ``stops``: entries of the log that end the run where they are true.
-    ``every``: visit every tick, not only those at which something acts.
-    Raises `CompilerError` if there is no compiler, or it fails.
-    """
+    """The ticks of a run with continuous states, gone through in C."""
 
     def __init__(
         self,
         workspace: Workspace,
         continuous: Continuous,
         plants: PlantsInC,
-        stops: Sequence[int],
+        stops: Sequence[int],  # entries of the log that end the run where they are true
         *,
-        every: bool,
-        machine: bool = False,
-        fuse: bool = False,
+        every: bool,  # visit every tick, not only those at which something acts
+        machine: bool = False,  # the virtual machine evaluates the functions, and no compiler is needed
+        fuse: bool = False,  # compile for the processor of this machine
     ):
         flat = self._flat = workspace.flat
         self._workspace, self._continuous, self._plants = workspace, continuous, plants
@@ -103,10 +98,7 @@ class HybridTicks:
         arrived: Callable[..., bool],
         progress: Callable[[float], Any],
     ) -> float | None:
-        """Run the ticks after tick ``k`` up to ``last`` and record them; see `CompiledTicks.run`.
-
-        Returns: time in s at which a stop condition has ended the run between two ticks.
-        """
+        """Run as `CompiledTicks.run`; return the time in s at which a stop condition ended it between two ticks."""
         loop = self._bind(recorder)
         if k == 0:  # of a run before nothing is left
             loop.begin_again()
@@ -198,12 +190,8 @@ class HybridTicks:
             self._take_back(loop)
 
     def go_between(self, t: float, end: float) -> float | None:
-        """Continue from t to an instant, both in s, before any tick there; nothing is recorded.
-
-        Within a step of the plants the loop waits for this; see `PlantsInC`.
-
-        Returns: time in s at which a stop condition has ended the run.
-        """
+        """Continue from t to an instant, before any tick there; return where a stop condition ended the run."""
+        # Within a step of the plants the loop waits for this, see `PlantsInC`; nothing is recorded.
         loop, none = self._loop, np.zeros((1, 0))
         assert loop is not None
         self._hand_over(loop, t)
@@ -301,12 +289,12 @@ class HybridTicks:
         return self._loop
 
     def _take_rare_tick(self) -> int:
-        """Evaluate a tick for C at which clocks act together too seldom for code of its own."""
+        """Evaluate a tick for C at which clocks act together too seldom for generated code."""
         assert self._loop is not None
         acting = self._flat.acting(round(float(self._workspace.here.t[0]) / self._flat.base))
         try:
             self._workspace.evaluate(acting)
-        except SimulationError:  # told where the loop breaks off
+        except SimulationError:  # raised where the loop breaks off
             return 1
         self._loop.note_taken(self._flat.taken_at(acting))
         return 0

@@ -25,12 +25,7 @@ from ..flat import FlatDiagram, StepTable, times_of
 
 
 class PlantsInC:
-    """The plants of a run, in the order in which the loop in C goes over them.
-
-    ``coupled``: their coupling, where it is another one than "jacobi".
-    ``entries``: what C goes over, by path: an FMU, or a step that Python takes; one step of all plants where they are
-    coupled.
-    """
+    """The plants of a run, in the order in which the loop in C goes over them."""
 
     def __init__(
         self, flat: FlatDiagram, plants: Mapping[str, Plant], steps: PlantSteps, coupled: CoupledSteps | None = None
@@ -43,6 +38,7 @@ class PlantsInC:
         self.entries: dict[str, FmuInstance | PythonStep] = {
             path: plant if isinstance(plant, FmuInstance) else partial(_step, plant) for path, plant in plants.items()
         }
+        """What C goes over, by path: an FMU, or a step that Python takes; one of all plants where they are coupled."""
         if coupled is not None:
             self.entries = {"": self._step_coupled}
 
@@ -70,7 +66,7 @@ class PlantsInC:
         return self.ended is not None or any(getattr(plant, "ends_run", False) for plant in self._plants.values())
 
     def prepare(self) -> Callable[[], object]:
-        """Return a function that compiles what the steps of plants need besides the code of a diagram."""
+        """Return a function that compiles what the steps of plants need apart from the code of a diagram."""
         return compile_other_side if any(map(runs_apart, self.entries.values())) else lambda: None
 
     def table(self, ticks: np.ndarray, last: int) -> StepTable | None:

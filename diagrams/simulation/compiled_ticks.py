@@ -89,21 +89,15 @@ class _Window:
 
 
 class CompiledTicks:
-    """The ticks of a run, gone through in C.
-
-    ``stops``: entries of the log that end the run where they are true.
-    ``every``: visit every tick, not only those at which a subsystem acts.
-    ``code``: their code; without it they are compiled.
-    Raises `CompilerError` if there is no compiler, or it fails.
-    """
+    """The ticks of a run, gone through in C."""
 
     def __init__(
         self,
         workspace: Workspace,
         plants: PlantsInC,
-        stops: Sequence[int],
+        stops: Sequence[int],  # entries of the log that end the run where they are true
         *,
-        every: bool,
+        every: bool,  # visit every tick, not only those at which a subsystem acts
         code: TickCode | None = None,
     ):
         flat = self._flat = workspace.flat
@@ -140,15 +134,10 @@ class CompiledTicks:
         last: int,
         recorder: Recorder,
         *,
-        arrived: Callable[..., bool],
+        arrived: Callable[..., bool],  # takes a tick, and whether plants are in the next step; returns: the run ends
         progress: Callable[[float], Any],
     ) -> None:
-        """Run the ticks after tick ``k`` up to ``last`` and record them.
-
-        ``arrived``: called with the ticks at which the loop has returned, and whether plants are in the next step
-        already, in which one may ask for the end; returns whether the run ends there.
-        ``progress``: called with the time after each chunk.
-        """
+        """Run the ticks after tick ``k`` up to ``last`` and record them."""
         for window in self._windows(k, last):
             if self._run_window(window, last, recorder, arrived, progress):
                 return
@@ -256,10 +245,8 @@ class CompiledTicks:
 def bind_evaluations(
     workspace: Workspace, find_code: Callable[[], TickCode]
 ) -> dict[frozenset[TickPattern], Callable[[], None]]:
-    """Return the evaluations of ticks in C, with the bits of interpreted ones; empty where they can't be had.
-
-    The functions of a large diagram take seconds to trace as a whole, and calls of its blocks need none of them.
-    """
+    """Return the evaluations of ticks in C, with the bits of interpreted ones; empty where they can't be had."""
+    # The functions of a large diagram take seconds to trace as a whole, and calls of its blocks need none of them.
     flat, here = workspace.flat, workspace.here
     if flat.loops.slices or flat.in_model_exchange:
         return {}

@@ -28,13 +28,7 @@ TIGHT = 1e-9
 
 
 class Continuous:
-    """The continuous part of a run.
-
-    ``domains``: the domains of the indicators; None without events.
-    ``delays``: transport delays; None without any.
-    ``own_events``: events of blocks in model exchange; None without such blocks.
-    ``beyond``: time in s and states of the last trial of the method at which a rate was not finite.
-    """
+    """The continuous part of a run."""
 
     def __init__(
         self,
@@ -54,6 +48,7 @@ class Continuous:
         self._left = math.inf
         self._nothing = np.zeros(self.where.size)
         self.beyond: tuple[float, np.ndarray] | None = None
+        """Time in s and states of the last trial of the method at which a rate was not finite."""
         self.resolution = rtol, atol
         """Relative and absolute tolerance."""
         self._loops = flat.active_loops(NOTHING)
@@ -131,11 +126,9 @@ class Continuous:
                 self.method.set_absolute_tolerance(absolute_tolerances(self.flat, self.resolution[1], nominals))
 
     def report_event(self, t: float, i: int, before: np.ndarray, after: np.ndarray) -> None:
-        """Say that event ``i`` has fired at t in s, with all states before and after it.
-
-        An FMU hears of every crossing of its indicators. One that comes back at once over the zero beyond which the
-        last event was located, and that changes no state, is no event of the run.
-        """
+        """Report that event ``i`` has fired at t in s, with all states before and after it."""
+        # An FMU hears of every crossing of its indicators. One that comes back at once over the zero beyond which the
+        # last event was located, and that changes no state, is no event of the run.
         event = self.flat.events[i]
         states = [{} if event.subsystem else state_values(self.flat, event.path, x) for x in (before, after)]
         if event.path in self.flat.in_model_exchange and self.domains is not None:
@@ -211,11 +204,8 @@ class Continuous:
     # --- parameters that change ------------------------------------------------------------------------------------
 
     def plan_with(self, path: str, block: Block) -> None:
-        """Plan steps with the instants that a variant of a block announces, or moves; see `Workspace.set_parameters`.
-
-        Raises `ParameterError` if the block changes within another time than before: the longest step of the method
-        follows from that.
-        """
+        """Plan steps with the instants that a variant of a block announces; see `Workspace.set_parameters`."""
+        # The longest step of the method follows from the time scale.
         if block.time_scale() != self.flat.table.blocks[path].time_scale():
             raise ParameterError(
                 "the solver's longest step follows from how fast it changes, such as the frequency of a sine, so this "
@@ -245,10 +235,7 @@ class Continuous:
         self.method.restore(saved["method"])
 
     def fits(self, old: Mapping[str, Block], new: Mapping[str, Block]) -> bool:
-        """Whether it fits variants of some blocks: no tolerance and no limit of a step changes with them.
-
-        ``old``, ``new``: by path: the blocks that it was set up with, and those that differ.
-        """
+        """Whether it fits variants of some blocks, by path: no tolerance and no limit of a step changes with them."""
         return self.delays is None and all(scales_of(block) == scales_of(old[path]) for path, block in new.items())
 
     def begin_again(self, flat: FlatDiagram) -> None:

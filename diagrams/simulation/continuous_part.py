@@ -26,20 +26,13 @@ class _Saved:
 
 
 class ContinuousPart:
-    """The blocks in continuous time between two ticks: advanced, saved and restored; see `Rest`.
-
-    Events are reported when they are accepted: those of a pass that is gone back over have not happened.
-
-    ``continuous``: its method, events and delays; None where nothing happens between ticks.
-    ``exchanged``: model-exchange FMUs, which keep their own memory.
-    ``go_between``: takes them from one instant to another, as `HybridTicks.go_between`; None where nothing happens
-    between ticks.
-    """
+    """The blocks in continuous time between two ticks: advanced, saved and restored; see `Rest`."""
 
     def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: BlocksInModelExchange):
         self._workspace, self._continuous, self._exchanged = workspace, continuous, exchanged
-        self._events: list[Occurrence] = []
+        self._events: list[Occurrence] = []  # reported when they are accepted: a pass may be gone back over
         self.go_between: Callable[[float, float], float | None] | None = None
+        """Takes them from one instant to another, as `HybridTicks.go_between`; None where nothing happens between."""
         if continuous is not None:
             self._report = continuous.on_event
             continuous.on_event = self._events.append

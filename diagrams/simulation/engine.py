@@ -41,10 +41,7 @@ if TYPE_CHECKING:
 
 
 class Engine:
-    """The numbers of a run, its plants, its solver and its events; it goes from tick to tick.
-
-    ``every_tick``: visit every tick, not only those at which a subsystem acts.
-    """
+    """The numbers of a run, its plants, its solver and its events; it goes from tick to tick."""
 
     def __init__(
         self,
@@ -52,7 +49,7 @@ class Engine:
         name: str,
         options: RunOptions,
         *,
-        every_tick: bool,
+        every_tick: bool,  # visit every tick, not only those at which a subsystem acts
         on_event: Callable[[Occurrence], None],
     ):
         self.flat, self.name = flat, name
@@ -187,10 +184,7 @@ class Engine:
         return plain and all(isinstance(p, FmuInstance) and p.native is not None for p in self.plants.values())
 
     def begin_again(self, flat: FlatDiagram, set_start: Callable[[Workspace], None] | None = None) -> None:
-        """Go back to t = 0 with other numbers; the plants, initialized again before, stay bound.
-
-        ``flat``: the diagram with its numbers; its functions are those that are bound.
-        """
+        """Go back to t = 0 with other numbers of the same functions; the plants, initialized before, stay bound."""
         self.workspace.begin_again(flat)
         self.position.restore(0, None)
         if self.continuous is not None:
@@ -261,10 +255,7 @@ class Engine:
         self._arrive(first)
 
     def go(self, last: int, recorder: Recorder, progress: Progress) -> None:
-        """Continue to a tick, or to where a stop condition ends the run.
-
-        ``progress``: called with the time now and then, and at the end.
-        """
+        """Continue to a tick, or to where a stop condition ends the run; ``progress`` takes the time now and then."""
         self.is_ahead, ticks = False, self._ticks()
         if self._compile == "auto" and not self._generated:
             progress = self._change_over.watch(last, progress, ticks.make_later, self._hand_over)
@@ -348,10 +339,9 @@ class Engine:
         self._can_stop = True
 
     def _end_within_step(self, error: SimulationError) -> bool:
-        """End the run where an FMU has asked for that within a step; return whether the error is such a request.
-
-        Where nothing moves between ticks, the run ends at the FMU's time with its last outputs, else at the last tick.
-        """
+        """End the run where an FMU has asked for that within a step; return whether the error is such a request."""
+        # Where nothing moves between ticks, the run ends at the FMU's time with its last outputs; else at the last
+        # tick.
         at, path, position = getattr(error, "ends_at", None), self._find_asking(), self.position
         plant: Any = self.plants.get(path)
         if at is None or plant is None:

@@ -38,25 +38,16 @@ def initialize(
     workspace: Workspace,
     plants: Mapping[str, Plant],
     delays: Delays | None,
-    take_inputs: Callable[[], None],
+    take_inputs: Callable[[], None],  # lets the plants see the inputs z
     exchanged: BlocksInModelExchange,
-    passes_on: str,
-    set_start: Callable[[Workspace], None],
+    passes_on: str,  # values, "agree": until inputs stay, "once", or "none": inputs of FMUs keep their start values
+    set_start: Callable[[Workspace], None],  # computes initial states and held outputs, as `find_start_values`
 ) -> None:
-    """Find values of everything at t = 0.
-
-    In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). Outputs are passed on
-    until inputs change by no more than rounding. Where some passes show that this takes many more, or leads away, the
-    values that a pass returns unchanged are found by `find_fixed_point`. So are initial states that depend on
-    themselves.
-
-    Initial states that are computed from inputs are those of the instant before: a source that jumps at t = 0 has its
-    value from the left there, so that a derivative sees the jump, as it sees one at any later time.
-
-    ``take_inputs`` lets the plants see the inputs z. ``passes_on`` is the exchange of values with them: "agree" until
-    their inputs stay, "once", or "none", where the inputs of FMUs keep their start values. ``set_start`` computes the
-    initial states and first held outputs from the values at hand, as `find_start_values` does.
-    """
+    """Find values of everything at t = 0: outputs are passed on until inputs change by no more than rounding."""
+    # In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). Where some passes show that
+    # agreement takes many more, or leads away, `find_fixed_point` finds the values that a pass returns unchanged. So
+    # are initial states that depend on themselves. States that are computed from inputs are those of the instant
+    # before: a source that jumps at t = 0 has its value from the left, so that a derivative sees the jump.
     workspace.here.t[0] = 0.0
     if delays is not None:
         delays.outputs_at(0.0, workspace.here.w)
@@ -68,10 +59,7 @@ def initialize(
 
 
 class _Start:
-    """The values of a run at t = 0, as they are sought.
-
-    A pass takes the outputs w of the plants, and the initial states x where these depend on themselves, to new ones.
-    """
+    """The values of a run at t = 0, as they are sought: a pass takes w, and x that depends on itself, to new ones."""
 
     def __init__(
         self,
@@ -359,17 +347,14 @@ def _jumps_at_start(block: Block) -> bool:
         return False
     try:
         return block.next_instant(_BEFORE_START) == 0.0
-    except Exception:  # it is not defined before t = 0; the run itself tells of one that fails after it
+    except Exception:  # it is not defined before t = 0; the run itself reports one that fails after it
         return False
 
 
 def domains_from_left(workspace: Workspace, domains: np.ndarray) -> np.ndarray:
-    """Return the domains of the indicators of all events just before t = 0: 1 above 0, −1 below, 0 on the border.
-
-    Subsystems are evaluated as if they acted: what a sampled one puts out before its first tick jumps with its sources.
-
-    ``domains``: those at t = 0: the answer for those that no jump of a source changes.
-    """
+    """Return the domains of all indicators just before t = 0 (1, −1, 0 on the border), from those at t = 0."""
+    # Subsystems are evaluated as if they acted: what a sampled one puts out before its first tick jumps with its
+    # sources.
     taps = values_from_left(workspace)
     if not taps:
         return domains

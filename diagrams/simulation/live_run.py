@@ -87,16 +87,11 @@ class Advancing(Protocol):
 
 @dataclass(frozen=True)
 class Pace:
-    """How a live run keeps pace.
+    """How a live run keeps pace."""
 
-    ``speed``: simulated seconds in a second of the clock.
-    ``catch_up``: seconds of the clock that are caught up after a delay; of a longer one all are given up.
-    ``clock``, ``sleep``: the clock in s, and what waits for some seconds of it.
-    """
-
-    speed: float = 1.0
-    frame: float = FRAME
-    catch_up: float = 0.25
+    speed: float = 1.0  # simulated seconds in a second of the clock
+    frame: float = FRAME  # seconds of the clock
+    catch_up: float = 0.25  # seconds of the clock that are caught up after a delay; of a longer one all are given up
     clock: Callable[[], float] = time.perf_counter
     sleep: Callable[[float], object] = time.sleep
 
@@ -128,12 +123,10 @@ class _Control:
 
 
 class Controls:
-    """Parameters that are moved by hand in a run.
-
-    ``inputs``: by name: a function of the time in s, an object with a ``value`` (a slider), or a number.
-    """
+    """Parameters that are moved by hand in a run."""
 
     def __init__(self, table: Structure, inputs: Mapping[str, Any], diagram: str):
+        # Each input is a function of the time in s, an object with a ``value`` (a slider), or a number.
         self._blocks: dict[str, Block] = {}
         self._last: dict[str, object] = {}
         self._controls: list[_Control] = []

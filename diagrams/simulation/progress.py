@@ -35,10 +35,9 @@ def _in_notebook() -> bool:
 
 
 class _NotebookLine:
-    """A line of text below a notebook's cell that changes while the cell runs, and is empty at the end.
+    """A line of text below a notebook's cell that changes while the cell runs, and is empty at the end."""
 
-    It is plain text, so a saved notebook keeps no widget without a kernel behind it. Work under 2 s leaves no output.
-    """
+    # It is plain text, so a saved notebook keeps no widget without a kernel behind it. Work under 2 s leaves no output.
 
     def __init__(self) -> None:
         self._begun = self._changed = time.monotonic()
@@ -113,10 +112,7 @@ def late_progress(name: str, start: float, end: float) -> Iterator[Callable[[flo
 
 @contextmanager
 def work_notes(name: str, show: ProgressOption = None) -> Iterator[Callable[[str], Any]]:
-    """Yield a function that takes in words what is being computed: the one given, or one that shows it with the time.
-
-    It is shown once the work has taken 2 s; without a choice on a terminal, and in a notebook.
-    """
+    """Yield a function that takes in words what is computed: the one given, or one that shows it, and the time."""
     if not _is_shown(show, name):
         yield show if callable(show) else lambda said: None
         return

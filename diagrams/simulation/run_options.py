@@ -202,10 +202,7 @@ class RunOptions:
 
 
 def ticks_in(duration: Any, base: Fraction, name: str) -> tuple[int, Fraction]:
-    """Return the number of ticks in a duration, and the seconds that are left after them.
-
-    Rounding of a few ulps, as in 0.1 + 0.2, is forgiven: nothing is left then.
-    """
+    """Return the number of ticks in a duration, and the seconds that are left; rounding of a few ulps is forgiven."""
     try:
         span = float(duration)
     except (TypeError, ValueError):
@@ -238,11 +235,9 @@ def refuse_rest(flat: FlatDiagram, n: int, duration: Any, name: str) -> None:
 
 
 def default_step(diagram: WiredDiagram, step: Any, duration: float | None, solver: str, start: Any = None) -> Any:
-    """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
-
-    That of the run that is continued; else a thousandth of the duration, in whole nanoseconds where it has them,
-    where the diagram has no FMU and the solver chooses its own steps.
-    """
+    """Return the seconds between two samples of a run that has neither a ``step`` nor a clock."""
+    # That of the run that is continued; else a thousandth of the duration, in whole nanoseconds where it has them,
+    # where the diagram has no FMU and the solver chooses its own steps.
     if step is not None or diagram.has_clock:
         return step
     if start is not None and hasattr(start, "base"):

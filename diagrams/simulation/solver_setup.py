@@ -32,10 +32,8 @@ def has_guards(flat: FlatDiagram) -> bool:
 
 
 def absolute_tolerances(flat: FlatDiagram, atol: float, nominals: np.ndarray | None = None) -> Any:
-    """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value.
-
-    ``nominals``: nominal values of the entries of x whose blocks declare none.
-    """
+    """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value."""
+    # ``nominals`` are those of the entries of x whose blocks declare none.
     scale = np.ones(flat.width) if nominals is None else nominals.copy()
     for path, own in flat.states.of_block.items():
         for name, where in own.slices.items():

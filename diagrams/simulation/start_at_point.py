@@ -59,10 +59,8 @@ def _started_there(block: Any, known: Mapping[str, Any]) -> Any:
 
 
 def _settable(diagram: WiredDiagram, point: OperatingPoint) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the FMUs in model exchange, with those states at a point that they take as start values.
-
-    Their continuous states are in x, so that a run begins with these in any case.
-    """
+    """Yield the FMUs in model exchange, with those states at a point that they take as start values."""
+    # Their continuous states are in x, so that a run begins with these in any case.
     for path, known in point.exchanged.items():
         block: Any = diagram.blocks[path]
         exact = {n: v for n, v in known["state"].items() if block.description.find(n).initial == "exact"}
@@ -79,10 +77,7 @@ def copy_states(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np
 
 
 def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
-    """Put a run that has just been initialized to the instant just before an operating point's tick; return that tick.
-
-    Raises `OptionError`: a point of another diagram, or one that is on none of the run's ticks.
-    """
+    """Put a run that has been initialized to the instant just before an operating point's tick; return that tick."""
     flat, here = workspace.flat, workspace.here
     tick = point.tick * point.base / flat.base
     if tick.denominator != 1:
@@ -104,11 +99,8 @@ def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
 
 
 def check_past(point: OperatingPoint, delays: Delays, name: str) -> None:
-    """Refuse to start a run with dead times from a point of a run that moves: it doesn't hold what has gone in before.
-
-    At rest that is what comes out, as it is where states are given.
-    """
-    if point.how is not PointOrigin.RUN:
+    """Refuse to start a run with dead times from a point of a run that moves: what has gone in before is unknown."""
+    if point.how is not PointOrigin.RUN:  # at rest what has gone in is what comes out, as where states are given
         return
     moved = [
         np.abs(point.z[where] - point.w[out]) / (1.0 + np.abs(point.w[out]))
@@ -126,11 +118,9 @@ def check_past(point: OperatingPoint, delays: Delays, name: str) -> None:
 
 
 def take_over(workspace: Workspace, x: np.ndarray, of: FlatDiagram, acting: frozenset[TickPattern]) -> None:
-    """Put a run to the states of another diagram, whatever is under the same name in both, and go through a tick.
-
-    States that only this diagram has, such as those of a delay, take the values that they settle at while the others
-    are held.
-    """
+    """Put a run to the states of another diagram, whatever is under the same name in both, and go through a tick."""
+    # States that only this diagram has, such as those of a delay, take the values that they settle at while the others
+    # are held.
     flat, here = workspace.flat, workspace.here
     marked = np.zeros(flat.width)
     copy_states(x, of, flat, here.x)

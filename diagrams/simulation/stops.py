@@ -12,13 +12,10 @@ from ..wiring import join
 
 
 class StopConditions:
-    """The stop conditions of a diagram, looked up in the last evaluation.
-
-    ``log``: the outputs of all blocks: the run's own vector, which it evaluates into.
-    ``asking``: returns the path of an FMU that asks for the end of the run; empty if none does.
-    """
+    """The stop conditions of a diagram, looked up in the last evaluation."""
 
     def __init__(self, flat: FlatDiagram, log: np.ndarray, asking: Callable[[], str]):
+        # log: outputs of all blocks, which the run evaluates into; asking: path of an FMU that asks for the end, or ""
         self._log, self._asking = log, asking
         self._entries: list[tuple[int, str]] = []
         for path in sorted(flat.checked.traced):

@@ -19,10 +19,7 @@ Port = tuple[str, str]
 
 
 class StartValues:
-    """Computes initial states and first held outputs as `find_start_values` does, from functions that are traced once.
-
-    ``workspace``: the numbers of the runs, to which the functions are bound.
-    """
+    """Computes what `find_start_values` does, from functions that are traced once."""
 
     def __init__(self, workspace: Workspace):
         flat = workspace.flat
@@ -110,18 +107,13 @@ class _StartFunctions:
 
 @dataclass(frozen=True, eq=False)
 class StartFunctions:
-    """The functions of a start, each of ``(x, w, p, left)``, with some sources as they are just before t = 0.
+    """The functions of a start, each of ``(x, w, p, left)``, with some sources as they are just before t = 0."""
 
-    ``places``: where the outputs of these sources are in ``left``. Its last entry is the time, 0.
-    ``inputs``: inputs of the blocks that start from them, with their ports, in the order in which the states are
-    computed.
-    ``held``, ``gates``: the first held outputs, and the signals that enable or trigger subsystems.
-    """
-
-    places: Mapping[Port, slice]
+    places: Mapping[Port, slice]  # of the outputs of these sources in ``left``, whose last entry is the time, 0
     inputs: Mapping[str, tuple[Any, list[str]]]
-    held: Any
-    gates: Any
+    """Inputs of the blocks that start from them, as a casadi.Function and ports, in the order of computation."""
+    held: Any  # casadi.Function of the first held outputs, or None
+    gates: Any  # that of the signals that enable or trigger subsystems, or None
 
     @property
     def width(self) -> int:
@@ -131,16 +123,14 @@ class StartFunctions:
 
 @dataclass(eq=False)
 class _Known:
-    """The traced functions of a diagram's start by the sources before t = 0, and its number of runs so far.
+    """What the runs of a diagram share of their starts."""
 
-    And the last initial state of each block, with the block and its inputs, as many runs start from the same ones. And
-    the blocks, with the paths of those that start from their inputs, and of the sources.
-    """
-
-    functions: dict[tuple[Port, ...], StartFunctions] = field(default_factory=dict)
+    functions: dict[tuple[Port, ...], StartFunctions] = field(default_factory=dict)  # by the sources before t = 0
     states: dict[str, tuple[Block, bytes, np.ndarray]] = field(default_factory=dict)
+    """The last initial state of each block, with the block and its inputs: many runs start from the same ones."""
     runs: int = 0
     sorted: tuple[list[Block], list[str], list[str]] | None = None
+    """The blocks, with the paths of those that start from their inputs, and of the sources."""
 
 
 def _known_of(flat: FlatDiagram) -> _Known:
@@ -154,13 +144,10 @@ def _sort(flat: FlatDiagram, blocks: list[Block]) -> tuple[list[str], list[str]]
 
 
 def choose_start_values(workspace: Workspace) -> Callable[[Workspace], None]:
-    """Return what computes a run's start values: traced functions, or block by block in the first run of a diagram.
-
-    To trace them takes as long as some starts, and a diagram may run once.
-    """
+    """Return what computes a run's start values: traced functions, or block by block in the first run of a diagram."""
     flat = workspace.flat
     known = _known_of(flat)
-    known.runs += 1
+    known.runs += 1  # to trace takes as long as some starts, and a diagram may run once
     if known.runs == 1 or flat.by_block or not StartValues.fits(flat):
         return find_start_values
     return StartValues(workspace).set

@@ -29,32 +29,28 @@ class Workspace:
     """The numbers of one run, with the diagram's functions bound to them.
 
     `evaluate` looks at an instant; `tick` and `jump` go beyond it: they take over the next states.
-
-    ``evaluators``: evaluators of the blocks of opaque stages, by path.
-    ``here``, ``trial``: the instant that the run has reached, and the one that a solver tries.
-    ``x_next``: x after the instant that was evaluated last.
-    ``log``: outputs there, as `FlatDiagram.log` lays them out; then x before the instant, and, with algebraic loops,
-    their residual.
-    ``ok``: shape (1,); 0 where a value was not finite or a guard failed.
-    ``native``: evaluations of ticks at ``here`` that need no traced function of the whole diagram, by the clocks that
-    act.
-    ``begun``: whether the start has been found: algebraic loops must determine their values from then on.
     """
 
     def __init__(self, flat: FlatDiagram, evaluators: Evaluators | None = None):
-        self.flat, self.evaluators = flat, evaluators
+        self.flat, self.evaluators = flat, evaluators  # those of the blocks of opaque stages, by path
         self.p = flat.p.copy()
         self.here, self.trial = Vectors(flat, self.p), Vectors(flat, self.p)
+        """The instant that the run has reached, and the one that a solver tries."""
         self.x_next = np.zeros(flat.width)
+        """x after the instant that was evaluated last."""
         self.z = np.zeros(flat.plant_inputs.total)
+        """Inputs of plants and of transport delays there."""
         self.log = np.zeros(flat.log.total + flat.width + bool(flat.loops.slices))
+        """Outputs there, by `FlatDiagram.log`; then x before the instant, and, with loops, their residual."""
         self.ok = np.zeros(1)
+        """0 where a value was not finite or a guard failed."""
         self.looped = bool(flat.loops.slices)
         self._evaluations: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._ticks: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._kept: list[Bound] = []
         self.native: Mapping[frozenset[TickPattern], Callable[[], None]] = {}
-        self.begun = False
+        """Evaluations of ticks at ``here`` that need no traced function of the whole diagram, by the acting clocks."""
+        self.begun = False  # whether the start is found: from then on loops must determine their values
         self.messages: tuple[str, ...] = ()
         self._solved: dict[tuple[frozenset[TickPattern], int], LoopSolver] = {}
 
@@ -127,10 +123,8 @@ class Workspace:
         return self._evaluations[acting]
 
     def evaluate_with_held(self) -> None:
-        """Evaluate the outputs at ``here``, between two ticks of a diagram without states in continuous time, into log.
-
-        Sampled blocks put out what they did at the last tick. With algebraic loops in continuous time all blocks do.
-        """
+        """Evaluate the outputs at ``here`` into log, between ticks of a diagram without continuous states."""
+        # Sampled blocks put out what they did at the last tick; with algebraic loops in continuous time all blocks do.
         flat, here = self.flat, self.here
         found: dict[str, Any] = {name: here.w[where] for name, where in flat.plant_outputs.slices.items()}
         if not flat.active_loops(NONE):
@@ -141,10 +135,7 @@ class Workspace:
             self.log[flat.log.slices[name]] = np.ravel(np.array(column))
 
     def bind_jump(self) -> Callable[[np.ndarray], None]:
-        """Return the call that lets events fire at ``here`` and takes over the states after them.
-
-        Its argument says which events fire, shape (number of events,).
-        """
+        """Return the call that lets events fire at ``here``, shape (events,), and takes over the states after them."""
         fired = np.zeros(len(self.flat.events))
         call = self._bind(self.flat.jump, self.here, [self.x_next], fired).call
         solve = self.loop_solver(NONE, self.here)
@@ -239,15 +230,12 @@ class Workspace:
     # --- algebraic loops ---------------------------------------------------------------------------------------------
 
     def loop_solver(self, acting: frozenset[TickPattern], vectors: Vectors) -> Callable[[], None] | None:
-        """Return the call that solves the algebraic loops at some of its vectors; None where there are none.
-
-        At ``here`` it also refuses values that the loops do not determine, once the run has begun.
-        """
+        """Return the call that solves the algebraic loops at some of its vectors; None where there are none."""
         loops = self.loops(acting, vectors)
         if loops is None or vectors is not self.here:
             return None if loops is None else loops.solve
 
-        def solve() -> None:
+        def solve() -> None:  # at ``here`` it also refuses values that the loops do not determine
             loops.solve(search=not self.begun)
             if self.begun:
                 loops.check_determined()

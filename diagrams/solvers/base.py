@@ -47,32 +47,22 @@ LARGE = 1e6  # size of a state compared with its scale, from which on its growth
 
 @dataclass(frozen=True)
 class Problem:
-    """The differential equation x' = rate(t, x).
-
-    ``rate``: ``rate(t, x)``: the derivative. It may return the same array at every call.
-    ``jacobian``: ``jacobian(t, x)``: ∂rate/∂x, size × size.
-    ``names``: name of each entry of x, for messages: ``"block.state[i]"``.
-    """
+    """The differential equation x' = rate(t, x)."""
 
     size: int
-    rate: Callable[[float, np.ndarray], np.ndarray]
-    jacobian: Callable[[float, np.ndarray], np.ndarray]
-    names: Sequence[str]
+    rate: Callable[[float, np.ndarray], np.ndarray]  # it may return the same array at every call
+    jacobian: Callable[[float, np.ndarray], np.ndarray]  # ∂rate/∂x, size × size
+    names: Sequence[str]  # of each entry of x, for messages: "block.state[i]"
 
 
 @dataclass(frozen=True)
 class Polynomial:
-    """The state over a step of a method: x + Σ cₖ ((time − t)/h)ᵏ, k ≥ 1.
-
-    ``t``, ``h``: start and length of the step, in s.
-    ``x``: shape (n,); state at the start.
-    ``coefficients``: shape (q, n); c₁ to c_q.
-    """
+    """The state over a step of a method: x + Σ cₖ ((time − t)/h)ᵏ, k ≥ 1."""
 
     t: float
     h: float
-    x: np.ndarray
-    coefficients: np.ndarray
+    x: np.ndarray  # at t
+    coefficients: np.ndarray  # c₁ to c_q, shape (q, n)
 
     def __call__(self, t: float) -> np.ndarray:
         """Return the state at a time within the step."""
@@ -85,28 +75,22 @@ class Polynomial:
 
 @dataclass(frozen=True)
 class AcceptedStep:
-    """One accepted step, from ``t_old`` to ``t``, where the state is ``x``; both in s.
-
-    ``prepare``: returns the dense output; valid until the solver's next step or restart.
-    """
+    """One accepted step, from ``t_old`` to ``t``, where the state is ``x``; both in s."""
 
     t_old: float
     t: float
     x: np.ndarray
-    prepare: Callable[[], Polynomial]
+    prepare: Callable[[], Polynomial]  # of the dense output; valid until the solver's next step or restart
 
 
 class Integration:
-    """A differential equation, the method that integrates it, and its tolerances; with the errors of that method.
-
-    ``rtol``, ``atol``: tolerances of a step; NaN with a fixed step.
-    ``max_step``: longest step in s; with a fixed step that step.
-    """
+    """A differential equation, the method that integrates it, and its tolerances; with the errors of that method."""
 
     fixed = False
     stiff = False  # made for stiff problems
 
     def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
+        # With a fixed step tolerances are NaN, and max_step is that step.
         self.name, self.problem, self.rtol, self.atol, self.max_step = name, problem, rtol, atol, max_step
         self.stop = -math.inf
         """The next discontinuity in s, beyond which the rates are not evaluated."""
@@ -137,10 +121,8 @@ class Integration:
             raise error
 
     def failure(self, t: float, x: np.ndarray, h: float, found: str = "") -> SimulationError:
-        """Return the error for a step that can't be made small enough, at the accepted point (t, x).
-
-        It names the entry with the largest weighted error there in a step of Euler's method.
-        """
+        """Return the error for a step that can't be made small enough, at the accepted point (t, x)."""
+        # It names the entry with the largest weighted error in a step of Euler's method.
         f = self.rate(t, x)
         try:
             self.check_finite(t, f, "rate")
@@ -174,11 +156,9 @@ class Integration:
         return stuck
 
     def _grows(self, i: int, t: float, x: np.ndarray, f: np.ndarray) -> bool:
-        """Whether a state is on its way to infinity: far above its scale, and growing fast beside the time so far.
-
-        The scale of a state is that at which both its tolerances are equal. A growth at the present rate by a factor of
-        e takes less than a tenth of the time so far.
-        """
+        """Whether a state is on its way to infinity: far above its scale, and growing fast for the time so far."""
+        # The scale of a state is that at which both its tolerances are equal. A growth at the present rate by a factor
+        # of e takes less than a tenth of the time so far.
         scale = float(np.broadcast_to(self.atol, x.shape)[i]) / self.rtol
         return bool(abs(x[i]) > LARGE * scale and (x[i] > 0.0) == (f[i] > 0.0) and abs(x[i]) < 0.1 * t * abs(f[i]))
 
@@ -189,12 +169,11 @@ class Integration:
 
 
 class Solver(Integration, ABC):
-    """A method of a library: `restart`, then `step` until ``t == stop``.
+    """A method of a library: `restart`, then `step` until ``t == stop``."""
 
-    C crosses intervals of a few ulps by itself, so that each stretch is longer than that.
-    """
+    _count, _mark = 0, 0.0  # steps since the restart, and the time of the last look at the progress
 
-    _count, _mark = 0, 0.0
+    # C crosses intervals of a few ulps by itself, so that each stretch is longer than that.
 
     def restart(self, t: float, x: np.ndarray, stop: float) -> None:
         """Start at (t, x), up to ``stop``: after each discontinuity, and at the start."""
@@ -235,18 +214,13 @@ class Library(Enum):
 
 @dataclass(frozen=True)
 class MethodFacts:
-    """What there is to know of a method.
-
-    ``stages``: of a fixed step: evaluations of the rates, by which `fmus/runtime/fixed_step.c` knows the method; else
-    0.
-    ``uses_slope``: whether it needs the derivative of the rates by the states.
-    """
+    """Facts of a method."""
 
     title: str
     kind: MethodKind = MethodKind.EXPLICIT
     library: Library | None = None
-    stages: int = 0
-    uses_slope: bool = False
+    stages: int = 0  # evaluations of a fixed step, by which `fmus/runtime/fixed_step.c` knows the method
+    uses_slope: bool = False  # whether it needs the derivative of the rates by the states
 
 
 METHODS = {

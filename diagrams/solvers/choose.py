@@ -67,10 +67,7 @@ def make_solver(
     atol: float | np.ndarray = 1e-9,
     max_step: float | None = None,
 ) -> Solver:
-    """Return the multistep method of a name, as a library has it; capitals don't matter.
-
-    ``rtol``, ``atol``: they hold each step's error in entry i below about atol[i] + rtol·|x[i]|.
-    """
+    """Return the multistep method of a name, as a library has it; capitals don't matter."""
     name, tolerance = _check(name, problem.size, rtol=rtol, atol=atol, max_step=max_step)
     longest = math.inf if max_step is None else float(max_step)
     return (Cvode if METHODS[name].library is Library.SUNDIALS else SciPySolver)(
@@ -84,11 +81,9 @@ class Method(Integration):
     "auto" is RK45 (DOP853 for rtol < 1e-8) as long as the problem is not stiff, and Radau where it is. Stiff means that
     stability bounds the step, not accuracy. Two evaluations at the end of each explicit step give an estimate of the
     dominant eigenvalue (E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, IV.2). If h|λ| stays beyond
-    the border of the stable region for 15 looks, and the leftmost eigenvalue of the exact Jacobian agrees, Radau goes
-    on. It hands back when h‖J‖ < 1 for 20 steps: an explicit method would take them too. Each change is reported.
-
-    ``rtol``, ``atol``: they hold each step's error in entry i below about atol[i] + rtol·|x[i]|.
-    ``max_step``: upper bound of the step of a variable-step method, s.
+    the border of the stable region for 15 looks, and the leftmost eigenvalue of the exact Jacobian agrees, Radau
+    continues. It hands back when h‖J‖ < 1 for 20 steps: an explicit method would take them, too. Each change is
+    reported.
     """
 
     def __init__(
@@ -129,10 +124,7 @@ class Method(Integration):
         self.active, self.planned, self._changes = self.names[0], dict.fromkeys(self.names), 0
 
     def decide(self, t: float, x: np.ndarray, h: float, *, stuck: bool) -> tuple[str, ...]:
-        """Decide at (t, x), after a sign at steps of h in s, which method continues; return what to report of it.
-
-        ``stuck``: whether the explicit method can take no step there.
-        """
+        """Decide at (t, x), after a sign at steps of h in s, which method continues; return what to report of it."""
         explicit, implicit = self.names[0], self.names[-1]
         if self.active == implicit:
             return self._change(explicit, t, h, "no longer stiff")

@@ -44,10 +44,7 @@ class _Method(Protocol):
 
 
 class SciPySolver(Solver):
-    """One of `scipy.integrate`'s multistep methods, given the exact Jacobian.
-
-    After a restart it starts again at order 1, and selects its first step again.
-    """
+    """One of `scipy.integrate`'s multistep methods, given the exact Jacobian; a restart begins at order 1 again."""
 
     _inner: _Method
     stiff = True

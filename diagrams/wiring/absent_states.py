@@ -9,10 +9,7 @@ from .structure import join
 
 
 def explain_absent_state(blocks: Mapping[str, Any], name: str) -> str:
-    """Return why a state of that name, or of a name that ends so, is left out, with a next step; "" if none is.
-
-    ``name``: path of the state, or an end of it: ``"controller.pid.integral"``, ``"pid.integral"``.
-    """
+    """Return why a state whose path is, or ends in, ``name`` is left out, with a next step; "" if none is."""
     for path, block in blocks.items():
         for state, reason in getattr(block, "absent_states", {}).items():
             full = join(path, state)

@@ -26,7 +26,7 @@ class Bus(Wireable):
 
     A subsystem whose function returns a mapping returns a bus, and an argument that is given one arrives in the
     function as a bus. Signals of a bus may be buses themselves: ``bus["axis"]["speed"]``. A bus never changes;
-    ``{**bus, "force": f}`` is one with a signal more, or another one. A bus of one signal stands for it.
+    ``{**bus, "force": f}`` is one with a signal more, or another one. A bus of one signal is taken for the signal.
 
     Raises
     ------
@@ -120,10 +120,7 @@ def flatten(bus: Any, owner: str, port: str) -> dict[tuple[str, ...], Signal]:
 def name_ports(
     paths: Mapping[tuple[str, ...], Any], owner: str, port: str, taken: Mapping[str, Any]
 ) -> dict[tuple[str, ...], str]:
-    """Return the port of a subsystem for each signal of a bus: its names, joined, after the bus's where that is taken.
-
-    Raises `DuplicateNameError`: for two signals with one port.
-    """
+    """Return the port of a subsystem for each signal of a bus: its names, joined, after the bus's if it is taken."""
     made: dict[tuple[str, ...], str] = {}
     for path in paths:
         name = "_".join(path)

@@ -296,10 +296,8 @@ def _known_shapes(table: Structure, shapes: dict[Port, Shape], path: str) -> lis
 
 
 def _assume(table: Structure, shapes: dict[Port, Shape], path: str) -> dict[Port, Shape]:
-    """Assume the unknown input shapes of a block in a loop; `_check_shapes` compares them with the wires later.
-
-    They become the shape of one of its known inputs, else that of its first state.
-    """
+    """Assume the unknown input shapes of a block in a loop; `_check_shapes` compares them with the wires later."""
+    # They become the shape of one of its known inputs, else that of its first state.
     block = table.blocks[path]
     shape = next(iter([*_known_shapes(table, shapes, path), *start_shapes(block)]), ())
     return {

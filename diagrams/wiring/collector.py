@@ -38,12 +38,10 @@ _Consumer = Call | SubsystemCall | _Inside | _Root | None
 
 
 class Collector:
-    """Walks from the roots against the wires, then gives every block its path.
-
-    Two blocks are the same node only if they are one object.
-    """
+    """Walks from the roots against the wires, then gives every block its path."""
 
     def __init__(self, roots: Iterable[object]):
+        # Two blocks are the same node only if they are one object.
         self.calls: dict[int, Call] = {}  # block identity → its call
         self.blocks: dict[int, Block] = {}  # every block met, in order
         self.subsystems: dict[int, SubsystemCall] = {}

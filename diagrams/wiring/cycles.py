@@ -8,10 +8,7 @@ import numpy as np
 
 
 def find_cyclic_parts(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[set[str]]:
-    """Return the strongly connected parts of a graph that have a cycle: several nodes, or one with an arrow to itself.
-
-    ``keys``: the nodes; the parts come in the order of their first ones.
-    """
+    """Return the strongly connected parts of a graph that have a cycle, in the order of their first nodes."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -14,12 +14,10 @@ from .structure import Structure, Wire, join
 
 
 def add_delay_blocks(table: Structure) -> Structure:
-    """Return the structure with a delay block for every output that leaves a subsystem with a computational delay.
-
-    The block is inside the subsystem, acts at its ticks, and is called ``delay_`` and the output's name, numbered
-    where two outputs share a name. Blocks inside the subsystem still read the output without delay. A wire that is
-    named inside and leaves the subsystem is the one that its consumers outside get: with the delay.
-    """
+    """Return the structure with a delay block for every output that leaves a subsystem with a computational delay."""
+    # The block acts at the subsystem's ticks, and is called ``delay_`` and the output's name, numbered where two share
+    # one. Blocks inside still read the output without delay. A wire that is named inside and leaves the subsystem
+    # is the one that its consumers outside get: with the delay.
     sampled = {}
     for path, block in sorted(table.blocks.items()):
         rate = table.rate(table.subsystem_of[path])

@@ -25,20 +25,16 @@ Entry = tuple[str, str, int]
 
 
 class EntryOrder:
-    """Order of the entries of ports that are stuck in or behind loops of ports.
-
-    ``waits``: for every output, next state and guard, the ports that it waits for.
-    ``start``: whether it is the order of initialization.
-    """
+    """Order of the entries of ports that are stuck in or behind loops of ports."""
 
     def __init__(
         self,
         table: Structure,
         traced: Mapping[str, Traced],
-        waits: Mapping[Port, set[Port]],
+        waits: Mapping[Port, set[Port]],  # the ports that each output, next state and guard waits for
         stuck: set[Port],
         *,
-        start: bool,
+        start: bool,  # whether it is the order of initialization
     ):
         self.table, self.traced, self.stuck = table, traced, stuck
         self.waits: dict[Entry, set[Entry]] = {}
@@ -47,8 +43,8 @@ class EntryOrder:
             self._add(path, name, waits[path, name], whole=whole)
 
     def sort(self, torn: Iterable[Port] = ()) -> tuple[list[OrderStep], dict[Port, set[Port]]]:
-        """Return the steps that can be evaluated, in order, and for each port that is stuck those it waits for."""
-        known = set(torn)
+        """Return the steps that can be evaluated, in order, and for each port that is still stuck what it waits for."""
+        known = set(torn)  # the values of these ports are taken as known
         waits = {entry: {s for s in sources if s[:2] not in known} for entry, sources in self.waits.items()}
         missing = {entry: len(sources) for entry, sources in waits.items()}
         consumers: dict[Entry, list[Entry]] = defaultdict(list)

@@ -24,17 +24,14 @@ from .structure import Structure
 
 
 def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool = False) -> dict[Port, set[Port]]:
-    """Return, for every output, next state and guard, the output ports that it waits for.
-
-    With ``start`` it is the graph of initialization. There a block that computes its initial state from its inputs
-    waits for all of them first.
-    """
+    """Return, for every output, next state and guard, the output ports that it waits for."""
     waits: dict[Port, set[Port]] = {}
     gated = {
         s: [(w.block, w.port) for g in table.gates(s) if (w := table.controls[g]).block in traced]
         for s in table.subsystems
     }
     for path, trace in traced.items():
+        # At initialization a block that computes its initial state from its inputs waits for all of them first.
         all_inputs = start and table.blocks[path].starts_from_inputs
         controls, sources = gated[table.subsystem_of[path]], dict[str, Port]()
         for port in trace.inputs:
@@ -52,18 +49,14 @@ class Order:
     """The order of evaluation."""
 
     steps: list[OrderStep]
-    torn: tuple[Port, ...] = ()
-    loops: tuple[str, ...] = ()
+    torn: tuple[Port, ...] = ()  # output ports whose values are taken as known
+    loops: tuple[str, ...] = ()  # every algebraic loop, printed port by port
 
 
 def evaluation_order(
     table: Structure, traced: Mapping[str, Traced], *, start: bool = False, solve: bool = False
 ) -> Order:
-    """Return the order of evaluation; a block is evaluated in one go where its inputs allow it.
-
-    ``start``: the order of initialization; see `dependencies`.
-    ``solve``: tear algebraic loops instead of refusing them.
-    """
+    """Return the order of evaluation, of initialization with ``start``; ``solve`` tears algebraic loops."""
     waits = dependencies(table, traced, start=start)
     steps, stuck = _sort(traced, waits)
     if not stuck:

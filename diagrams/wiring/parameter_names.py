@@ -18,11 +18,9 @@ OF_A_SUBSYSTEM = ("sample_time", "method", "offset", "delay")
 
 
 def find_name(table: Structure, name: object, diagram: str) -> str:
-    """Return the full path of a parameter, a start value, a subsystem's setting or a block.
-
-    A start value of an FMU is found without ``start`` as well: ``"plant.mass"`` is ``"plant.start.mass"``. An entry of
-    an array is one, too, counted from 1: ``"motor.denominator[1]"``.
-    """
+    """Return the full path of a parameter, a start value, a subsystem's setting or a block."""
+    # A start value of an FMU is found without ``start`` as well: "plant.mass" is "plant.start.mass". An entry of an
+    # array is one, too, counted from 1: "motor.denominator[1]".
     name = check_name(name, diagram)
     if name in table.blocks:
         return name
@@ -55,11 +53,9 @@ def find_place(table: Structure, name: str, diagram: str) -> tuple[str, list[str
 
 
 def find_control(table: Structure, name: object, diagram: str) -> tuple[str, list[str]]:
-    """Return the path of a block, and the names that lead to a parameter in it, of what is moved by hand in a run.
-
-    Next to a parameter (`find_place`), a source is named by its own name, or by that of the wire that comes out of it:
-    ``value`` of the `Constant` or `Reference` there is meant.
-    """
+    """Return the path of a block, and the names that lead to a parameter in it, of what is moved by hand in a run."""
+    # Next to a parameter (`find_place`), a source is named by its own name, or by that of the wire that comes out of
+    # it: ``value`` of the `Constant` or `Reference` there is meant.
     name = check_name(name, diagram)
     found = [name] if name in table.blocks else [path for path in table.blocks if path.endswith("." + name)]
     if not found and name in table.names:
@@ -106,7 +102,7 @@ def name_parameters(block: Block, path: str) -> str:
 
 
 def _describe_other(table: Structure, path: str) -> str:
-    """Return what a name that is no parameter's stands for, and the parameters there; "" if nothing is called that."""
+    """Return what a name that is no parameter's means, and the parameters there; "" if nothing is called that."""
 
     def ends(known: Iterable[str]) -> list[str]:
         return [p for p in known if p and (p == path or p.endswith("." + path))]

@@ -174,10 +174,7 @@ class Structure:
 
 
 def stepped_blocks(table: Structure, inside: str = "") -> dict[str, Block]:
-    """Return the blocks that a run steps from outside, such as FMUs, by path in alphabetical order.
-
-    ``inside``: path of a block or a subsystem, to which the search is limited; the whole diagram without it.
-    """
+    """Return the blocks that a run steps from outside, such as FMUs, sorted by path; ``inside``: those in a place."""
     paths = [p for p, b in table.blocks.items() if b.stepped and (not inside or f"{p}.".startswith(f"{inside}."))]
     return {path: table.blocks[path] for path in sorted(paths)}
 

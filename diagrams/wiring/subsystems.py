@@ -79,7 +79,7 @@ def check_delay(value: object, sample_time: Fraction | None, *, block: str) -> i
 
 
 class SubsystemInput:
-    """The inside of a subsystem's input: stands for the signal that is wired to it outside."""
+    """The inside of a subsystem's input, in place of the signal that is wired to it outside."""
 
     def __init__(self, call: SubsystemCall, port: str):
         self.call, self.port = call, port

@@ -30,10 +30,8 @@ V = TypeVar("V", bound=Value)
 
 
 def apply_changes(table: Structure, changes: Iterable[tuple[object, object]], diagram: str) -> Structure:
-    """Return the structure of a variant; see `Diagram.replace`.
-
-    Blocks come first, then whole parameters, then parts of them. So no change takes another one back, in any order.
-    """
+    """Return the structure of a variant; see `Diagram.replace`."""
+    # Blocks come first, then whole parameters, then parts of them. So no change takes another one back, in any order.
     table = table.copy()
     named = [(check_name(name, diagram), value) for name, value in changes]
     blocks = [isinstance(value, Block) and _names_block(table, path) for path, value in named]
@@ -142,7 +140,7 @@ def _find_subsystem(table: Structure, path: str, key: str, diagram: str) -> str 
         return None
     offered = ", ".join(f"{subsystem}.{key}" for subsystem in known)
     step = f"its subsystems have: {offered}" if offered else "leave it out: this diagram has no subsystem"
-    raise UnknownNameError(f"a diagram has no {key!r} of its own; {step}.")
+    raise UnknownNameError(f"a diagram has no {key!r}; {step}.")
 
 
 def _change_subsystem(settings: SubsystemSettings, key: str, value: Any) -> SubsystemSettings:
@@ -164,21 +162,15 @@ def _change_subsystem(settings: SubsystemSettings, key: str, value: Any) -> Subs
 
 
 def change_parameter(block: V, keys: list[str], value: object) -> V:
-    """Return ``block`` with the parameter at a path of attribute names or mapping keys changed.
-
-    The last name may be an entry of an array: ``"denominator[1]"``.
-    """
+    """Return ``block`` with the parameter at a path of names changed; the last may be an entry, ``"x[1]"``."""
     return change_parameters(block, [(keys, value)])
 
 
 def change_parameters(block: V, changes: Iterable[tuple[list[str], object]]) -> V:
-    """Return ``block`` with several of its parameters changed at once: it is checked with all of them, and built once.
-
-    Whole parameters come first, then their entries and parts; see `change_parameter`.
-    """
+    """Return ``block`` with several of its parameters changed at once: checked with all of them, and built once."""
     found: dict[str, Any] = {}
     specs = type(block).parameter_specs
-    for keys, value in sorted(changes, key=place_of_change):
+    for keys, value in sorted(changes, key=place_of_change):  # whole parameters, then their entries and parts
         name = keys[0]
         whole, entry = split_entry(name, specs) if len(keys) == 1 else (name, ())
         if whole in found and whole in specs and (entry or len(keys) > 1) and not isinstance(found[whole], np.ndarray):

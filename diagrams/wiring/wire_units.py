@@ -15,10 +15,8 @@ _MOST_ROUNDS = 100
 
 
 def follow_units(table: Structure, converted: Mapping[Port, Unit]) -> dict[Port, Unit]:
-    """Return the unit of every output that has one: declared, or that of the input which the output is like.
-
-    ``converted``: units to which wires are converted, by the input at their end.
-    """
+    """Return the unit of every output that has one: declared, or that of the input which the output is like."""
+    # ``converted``: units to which wires are converted, by the input at their end.
     units: dict[Port, Unit] = {}
     for path, block in table.blocks.items():
         for name, port in block.outputs.items():
@@ -106,12 +104,10 @@ def _input_units(
 
 
 def add_unit_conversions(table: Structure) -> Structure:
-    """Return the structure with a `UnitConversion` in each wire between two units where one of its blocks converts.
-
-    The block is in the subsystem of the consumer. It is called ``convert_`` and the names of the consumer and its
-    input. A block whose inputs are all in one unit, such as a sum, takes that of the first input whose source does not
-    convert.
-    """
+    """Return the structure with a `UnitConversion` in each wire between two units where one of its blocks converts."""
+    # The block is in the subsystem of the consumer, called ``convert_`` and the names of the consumer and its input.
+    # A block whose inputs are all in one unit, such as a sum, takes that of the first input whose source does not
+    # convert.
     if not any(block.converts_units for block in table.blocks.values()):
         return table
     inputs = {path: block.inputs for path, block in table.blocks.items()}
