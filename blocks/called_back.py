@@ -24,11 +24,10 @@ class CalledBack:
         *,
         interrupted: Callable[..., None] | None = None,
     ) -> int:
-        """Return the address of a function for C, which lives as long as this.
+        """Return the address of ``call`` for C, a function of ctypes' ``kind``, which lives as long as this object.
 
-        ``call``: the function; None stands for 0.
-        ``failed``: its result where an error waits.
-        ``interrupted``: called in its place, with its arguments, where an interrupt has come before.
+        A result of None is 0, and that of a failed call is ``failed``. Where an interrupt has come before,
+        ``interrupted`` is called in its place.
         """
 
         def guarded(*arguments: Any) -> int:

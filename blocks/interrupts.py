@@ -19,13 +19,11 @@ class Interrupts(threading.local):
     """Keeps an interrupt (Ctrl-C) that comes while C runs, until Python is where it can be raised.
 
     Python raises it at its next instruction: the first one of a function that C calls, where ctypes would drop it.
-
-    ``heard``: whether an interrupt is raised at once: Python has been called by C, and catches it.
-    ``came``: whether one waits to be raised.
     """
 
     def __init__(self) -> None:
-        self.heard = self.came = False
+        self.heard = False  # True while Python, called by C, catches an interrupt: it is raised at once
+        self.came = False  # True while one waits to be raised
 
     @contextmanager
     def kept(self) -> Iterator[None]:

@@ -53,17 +53,12 @@ def shortened(name: str, value: Any) -> str:
 
 @dataclass(frozen=True)
 class Kind:
-    """Declared kind of values, with the words of the error for another one.
+    """Declared kind of values, with the words of the error for another one."""
 
-    ``holds``: whether a value is of the kind.
-    ``step``: one next step, or a function of the value that returns it; without one: to give such a value.
-    ``found``: returns the error's first words from the argument's name and its value.
-    """
-
-    expected: str
-    holds: Callable[[Any], object]
-    step: str | Callable[[Any], str] | None = None
-    found: Callable[[str, Any], str] = shortened
+    expected: str  # the kind in words
+    holds: Callable[[Any], object]  # whether a value is of the kind
+    step: str | Callable[[Any], str] | None = None  # next step, or a function of the value; None: to give such a value
+    found: Callable[[str, Any], str] = shortened  # from the argument's name and its value to the error's first words
 
     def worded(
         self,
@@ -98,9 +93,8 @@ class Kind:
 def accepts(called: str | None = "", error: type[LoopwrightError] = OptionError, /, **kinds: Kind) -> Callable[[F], F]:
     """Check the kinds of a function's arguments before it runs, or of a dataclass's fields; a default is always right.
 
-    ``called``: name by which users know the function, where it is another one, or that of an argument's object:
-    ``"{diagram.name}"``. None: the callers fill it in.
-    ``**kinds``: a kind for each argument that is checked; one of ``*args`` or ``**kwargs`` holds for each of their
+    ``called`` is the name by which users know the function, where it is another one, or that of an argument's object,
+    ``"{diagram.name}"``; None: the callers fill it in. A kind of ``*args`` or ``**kwargs`` holds for each of their
     values.
     """
 

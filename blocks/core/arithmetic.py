@@ -23,13 +23,7 @@ def shape_of(value: Array) -> Shape:
 
 
 def describe_shape(shape: tuple[int, ...] | None) -> str:
-    """Return a shape in words, for messages; None is any one.
-
-    Examples
-    --------
-    >>> describe_shape(()), describe_shape((2,))
-    ('a scalar', '(2,)')
-    """
+    """Return a shape in words, for messages, such as ``a scalar`` or ``(2,)``; None is any one."""
     if shape is None:
         return "any shape"
     return str(shape) if shape else "a scalar"
@@ -221,7 +215,6 @@ class Demux(Block):
             raise ParameterError(
                 f"found {shorten(self.sizes)}; expected the number of scalars, such as 3, or the entries of each "
                 "output, such as (2, 1). Give whole numbers of one or more.",
-                block=self.label,
                 port="sizes",
             )
 

@@ -64,7 +64,7 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
     depend on anything but them and the parameters. Build vectors with ``np.stack``, and branches with ``np.where``.
 
     A block has continuous states if it has a ``derivative``, sampled ones if it has an ``update`` alone. A continuous
-    block in a sampled subsystem is discretized by the subsystem's method, unless it has an ``update`` of its own.
+    block in a sampled subsystem is discretized by the subsystem's method, unless it has its own ``update``.
     A continuous block may declare events and discrete states, which its ``jump`` changes. With an ``update`` as well it
     works in both kinds of subsystem: its events act in a continuous one, its ``update`` in a sampled one. The diagram
     itself counts as the outermost subsystem.
@@ -331,7 +331,7 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
 
     def _signal(self) -> Signal:
         if any(port.default is None for port in self.inputs.values()) or len(primary_outputs(self.outputs)) != 1:
-            return as_signal_error(self)
+            raise _signal_error(self)
         return Signal(self, primary_outputs(self.outputs)[0])
 
     def __iter__(self) -> Iterator[Signal]:
@@ -345,7 +345,7 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
         return ""
 
     def entries_of(self, parameter: str) -> Collection[str]:
-        """Return the names that entries of a mapping among its parameters may have, besides those that it holds."""
+        """Return the names that entries of a mapping among its parameters may have, apart from those that it holds."""
         return ()
 
     def check_place(self, old: Block, wired: Collection[str], read: Collection[str]) -> None:
@@ -413,10 +413,7 @@ def _is_kind(port: Port, attribute: str) -> bool:
 
 
 def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
-    """Match the arguments of a call with the block's inputs.
-
-    Signals by position go to the inputs in their order, or, if they are as many as inputs without a default, to these.
-    """
+    """Match the arguments of a call with the block's inputs."""
     inputs, who = block.inputs, block.label
     if len(args) > len(inputs):
         step = f" For one vector of them give a tuple: {who}((…, …))." if len(inputs) == 1 else ""
@@ -426,7 +423,8 @@ def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[s
             f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).{step}", block=who
         )
     required = [name for name, port in inputs.items() if port.default is None and name not in kwargs]
-    # as many signals as inputs need are theirs, wherever inputs with a default are
+    # Signals by position go to the inputs in their order. As many signals as there are inputs without a default go to
+    # these, wherever the others are.
     given = dict(zip(required if len(args) == len(required) else inputs, args, strict=False))
     for name, value in kwargs.items():
         if name not in inputs:
@@ -446,18 +444,15 @@ def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[s
     return {name: as_signal(value, block=who, port=name) for name, value in given.items()}
 
 
-def as_signal_error(block: Block) -> Signal:
-    """Raise the error of a block that is used as a signal and has inputs, or not exactly one output."""
+def _signal_error(block: Block) -> WiringError:
+    """Return the error of a block that is used as a signal and has inputs, or not exactly one output."""
     outputs = ", ".join(primary_outputs(block.outputs)) or "none"
     needed = [name for name, port in block.inputs.items() if port.default is None]
     if needed:
-        raise WiringError(
+        return WiringError(
             f"it is used as a signal before it is wired; call it first, or name an output ({outputs}): "
             f"{block.label}({', '.join(f'{n}=…' for n in needed)}).",
             block=block.label,
         )
     found, step = len(primary_outputs(block.outputs)), "Name one." if block.outputs else "Declare one."
-    raise WiringError(f"found {found} outputs ({outputs}); expected one, as a signal. {step}", block=block.label)
-
-
-__all__ = ["Block", "as_signal"]
+    return WiringError(f"found {found} outputs ({outputs}); expected one, as a signal. {step}", block=block.label)

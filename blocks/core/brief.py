@@ -6,25 +6,13 @@ from collections.abc import Iterable
 
 
 def brief(kind: str, *facts: str, then: str = "") -> str:
-    """Return a short text of a value; facts that are empty are left out.
-
-    Examples
-    --------
-    >>> brief("run of 'drive'", "11 samples from 0 to 1 s", "", then="run['y']")
-    "<run of 'drive': 11 samples from 0 to 1 s; run['y']>"
-    """
+    """Return a short text of a value, such as ``<run of 'drive': 11 samples; run['y']>``, without empty facts."""
     shown = ", ".join(fact for fact in facts if fact)
     return f"<{kind}{': ' if shown else ''}{shown}{'; ' if then else ''}{then}>"
 
 
 def enumerate_some(names: Iterable[str], most: int = 4) -> str:
-    """Return some names in a row, and the number of the others.
-
-    Examples
-    --------
-    >>> enumerate_some(["x", "y", "z"], most=2)
-    'x, y and 1 more'
-    """
+    """Return some names in a row, and the number of the others: ``x, y and 1 more``."""
     found = list(names)
     more = f" and {len(found) - most} more" if len(found) > most else ""
     return ", ".join(found[:most]) + more

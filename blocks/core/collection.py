@@ -12,11 +12,9 @@ R = TypeVar("R")
 
 
 def without_collection(function: Callable[P, R]) -> Callable[P, R]:
-    """Run a function without cyclic garbage collection, and continue with it after, if it was on.
-
-    The collector would look at all values again and again while they grow: a third of the time for 10,000 blocks.
-    Reference counts continue. Several threads may do so at once: whoever has turned it off turns it on again.
-    """
+    """Run a function without cyclic garbage collection, and continue with it after, if it was on."""
+    # The collector would look at all values again and again while they grow: a third of the time for 10,000 blocks.
+    # Reference counts continue. Several threads may do so at once: whoever has turned it off turns it on again.
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:

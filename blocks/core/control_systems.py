@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-_BLOCKS = {"StateSpace": "StateSpace", "TransferFunction": "TransferFunction"}
+_KINDS = ("StateSpace", "TransferFunction")  # the blocks have the names of python-control's classes
 
 
 def kind_of_system(value: Any) -> str:
     """Return the class of python-control's that a linear system is of, "" of anything else; it isn't imported."""
     names = (base.__name__ for base in type(value).__mro__ if base.__module__.partition(".")[0] == "control")
-    return next((name for name in names if name in _BLOCKS), "")
+    return next((name for name in names if name in _KINDS), "")
 
 
 def system_text(value: Any) -> str:
@@ -20,11 +20,8 @@ def system_text(value: Any) -> str:
 
 
 def as_block(value: Any, wired: str = "") -> str:
-    """Return what to write in place of a linear system of python-control, "" of anything else.
-
-    ``wired``: what follows the block, such as ``"(u)"``.
-    """
+    """Return what to write for a linear system of python-control, wired by ``"(u)"``, say; "" of anything else."""
     if not (kind := kind_of_system(value)):
         return ""
-    block = _BLOCKS[kind] if value.dt in (0, None) else f"Discrete{_BLOCKS[kind]}"
+    block = kind if value.dt in (0, None) else f"Discrete{kind}"
     return f"A block is made of it by {block}.from_control(system){wired}"

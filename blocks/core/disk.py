@@ -27,14 +27,12 @@ _PROBE = 2**24
 def describe_disk_error(error: OSError, place: str | os.PathLike[str], instead: str) -> str:
     """Return what the system found wrong with a file or folder, what was expected, and one next step.
 
-    ``error``: the system's error. Where one of ours was made of it before, that one's cause counts.
-    ``place``: the file or folder that was used; an error that names another one is about that.
-    ``instead``: a sentence that says how to use another place, such as "Name another folder." It is the next step
-    wherever nothing can be mended in this one.
+    The step is ``instead``, such as "Name another folder.", wherever nothing can be mended in this place.
     """
+    # where one of our errors was made of the system's before, the cause counts
     while isinstance(error, DiskError) and isinstance(error.__cause__, OSError):
         error = error.__cause__
-    named = _name_in(error)
+    named = _name_in(error)  # an error that names another path than the place is about that one
     path = named or os.fspath(place)
     there, code = _nearest(path), error.errno
     # A relative path says nothing where the working folder is gone, so this comes before all other causes.
@@ -86,9 +84,9 @@ def explain_disk_errors(
     raised: type[LoopwrightError] = DiskError,
     **where: Any,
 ) -> Iterator[None]:
-    """Turn an error of the system, within a block that uses a file or folder, into one of ours.
+    """Turn an error of the system, within a block that uses a file or folder, into ``raised``, at ``where``.
 
-    ``failed``: what failed, such as "the FMU can't be built": the error begins with it.
+    It begins with what has ``failed``, such as "the FMU can't be built"; see `describe_disk_error` for the rest.
     """
     try:
         yield
@@ -101,10 +99,8 @@ def explain_disk_errors(
 
 
 def find_disk_error(folder: str | os.PathLike[str]) -> OSError | None:
-    """Return the error of a trial file of 16 MiB in a folder; None where it can be written.
-
-    Another program, such as a compiler, says in its own words alone that it could not write.
-    """
+    """Return the error of a trial file of 16 MiB in a folder; None where it can be written."""
+    # another program, such as a compiler, says in its own words alone that it could not write
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(_PROBE))

@@ -157,12 +157,12 @@ class DuplicateNameError(WiringError):
 
 
 class UnknownNameError(WiringError, KeyError):
-    """A path, port, signal or parameter of that name does not exist, or a short name stands for several.
+    """A path, port, signal or parameter of that name does not exist, or a short name is that of several.
 
     Attributes
     ----------
     candidates : tuple of str
-        The full names that a short name stands for; empty if it stands for none.
+        The full names that a short name may mean; empty if there are none.
     """
 
     candidates: tuple[str, ...] = ()

@@ -8,24 +8,17 @@ import numpy as np
 
 
 class Wanted(NamedTuple):
-    """Quantities that are wanted of a block, in the order in which they are returned, flat.
+    """Quantities that are wanted of a block, in the order in which they are returned, flat."""
 
-    ``rates``: whether the derivatives of all states follow.
-    ``indicators``: whether the indicators of all events follow.
-    """
-
-    outputs: tuple[str, ...] = ()
-    rates: bool = False
-    indicators: bool = False
+    outputs: tuple[str, ...] = ()  # names of ports
+    rates: bool = False  # whether the derivatives of all states follow
+    indicators: bool = False  # whether the indicators of all events follow
 
 
 class EvaluationVectors(NamedTuple):
-    """Vectors that an evaluation reads, and the one that it writes, where they are; all of float64.
+    """Vectors that an evaluation reads, and the one that it writes, where they are; all flat, of float64."""
 
-    ``t``: time in s, shape (1,).
-    """
-
-    t: np.ndarray
-    x: np.ndarray
-    u: np.ndarray
-    into: np.ndarray
+    t: np.ndarray  # time in s, shape (1,)
+    x: np.ndarray  # the block's states
+    u: np.ndarray  # its inputs
+    into: np.ndarray  # the result

@@ -44,16 +44,13 @@ class UnknownArgumentError(OptionError, UnknownNameError):
         )
 
     def offer(self, block: str, more: Iterable[str]) -> None:
-        """Report the function that was called, which has arguments of its own besides those that it hands on."""
+        """Report the function that was called, which has further arguments than those that it hands on."""
         self.known |= frozenset(more)
         self.block, self.message = block, self._describe()
 
 
 def offer_elsewhere(**ways: str) -> Callable[[F], F]:
-    """Make the errors of a function's calls offer what to write for names that are no arguments of it.
-
-    ``**ways``: for each name the text, such as ``title="about={'title': …}"``.
-    """
+    """Make the errors of a function's calls offer what to write for other names: ``title="about={'title': …}"``."""
 
     def mark(function: F) -> F:
         setattr(function, _ELSEWHERE, ways)
@@ -66,12 +63,10 @@ def explain_calls(subject: F) -> F:
     """Make a function, or the public methods of a class, say which arguments don't fit their signatures.
 
     Python ends such a call (a misspelt keyword, one argument too many, none where one is needed) in a `TypeError`; it
-    becomes an `OptionError` that names the argument and those near it. The signature is looked at only then: a call
-    whose arguments fit costs one frame more, and nothing else.
-
-    ``subject``: a class is changed in place, after `dataclass` has made its constructor; methods that it inherits stay
-    as they are.
+    becomes an `OptionError` that names the argument and those near it. A class is changed in place, after `dataclass`
+    has made its constructor; methods that it inherits stay as they are.
     """
+    # the signature is looked at only then: a call whose arguments fit costs one frame more, and nothing else
     if not inspect.isclass(subject):
         return _explained(subject)
     for name, member in [*vars(subject).items()]:

@@ -38,8 +38,6 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     If the block fails, or is interrupted, nothing is left of the new file, and an old one stays as it was: a full disk
     cuts no file. The name ends as ``path`` does. Whatever is no regular file, such as a pipe, is written directly.
-
-    Raises `DiskError` if the file can't be written.
     """
     given = Path(path).expanduser()
     with explain_disk_errors(f"{str(path)!r} can't be written", given, OTHER_FILE):
@@ -65,9 +63,6 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text as UTF-8; the file appears whole or not at all.
-
-    Raises `DiskError` if the file can't be written.
-    """
+    """Write a text as UTF-8; the file appears whole or not at all."""
     with replace_file(path) as fresh:
         fresh.write_text(text, encoding="utf-8")

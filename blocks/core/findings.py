@@ -16,8 +16,8 @@ class Finding:
     Attributes
     ----------
     limits_numbers : bool
-        Whether numbers that are made from the result may be wrong because of it. Only such findings are carried to
-        numbers.
+        Whether numbers that are made from the result may be wrong because of it. Only such findings are passed on
+        to numbers.
     """
 
     limits_numbers: ClassVar[bool] = True

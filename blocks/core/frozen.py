@@ -11,11 +11,9 @@ from .errors import ParameterError
 
 
 class FrozenMapping(Mapping[Any, Any]):
-    """A read-only mapping of read-only values that can be compared, hashed and pickled.
+    """A read-only mapping of read-only values that can be compared, hashed and pickled."""
 
-    The standard library's `types.MappingProxyType` can't be pickled, and shows changes of the mapping behind it.
-    """
-
+    # the standard library's `types.MappingProxyType` can't be pickled, and shows changes of the mapping behind it
     __slots__ = ("_items",)
     _items: dict[Any, Any]
 

@@ -16,10 +16,8 @@ _TOLERANCE = 4.0 * float(np.finfo(float).eps)  # of t: t, the period and their r
 
 
 def left_of(t: float) -> float:
-    """Return a time just before t, at which an edge at t has not come yet for `period_of` with its tolerance.
-
-    A solver takes left limits at t there. The floating-point number before t would be too near.
-    """
+    """Return a time just before t, at which an edge at t has not come yet for `period_of` with its tolerance."""
+    # a solver takes left limits at t there; the floating-point number before t would be too near
     return t - 4.0 * _TOLERANCE * abs(t)
 
 
@@ -34,10 +32,8 @@ def is_before(a: float, b: float) -> bool:
 
 
 def move_earlier(instants: Array) -> Array:
-    """Return the first times that count as the given instants: 2e-15 t earlier, which allows for their rounding.
-
-    Three times 0.1 is more than the tick at 0.3, and so may a time of ``np.linspace`` be; both mean the tick.
-    """
+    """Return the first times that count as the given instants: 2e-15 t earlier, which allows for their rounding."""
+    # three times 0.1 is more than the tick at 0.3, and so may a time of np.linspace be; both mean the tick
     return instants - 2.0 * _TOLERANCE * np.abs(instants)
 
 
@@ -50,15 +46,10 @@ def period_of(t: Array, period: Array, delay: Array) -> tuple[Array, Array, Arra
 
 
 def read_time(value: float) -> Fraction | None:
-    """Return the exact seconds that a floating-point number stands for; None where that can't be told.
+    """Return the exact seconds that a floating-point number means; None where that is open, as for 0.1 + 0.2.
 
     A number that is a multiple of 1 ns is that decimal number: 0.0007 is 7/10000. Else it is p/q with q up to 10⁶, if
     that is the number when it is rounded: 1/3, 1/44100.
-
-    Examples
-    --------
-    >>> read_time(0.0007), read_time(1 / 44100), read_time(0.1 + 0.2)
-    (Fraction(7, 10000), Fraction(1, 44100), None)
     """
     decimal = Fraction(repr(float(value)))
     if (decimal / FINEST).denominator == 1:

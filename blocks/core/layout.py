@@ -15,26 +15,13 @@ from .ports import Shape
 
 
 def elements(name: str, shape: Shape) -> list[str]:
-    """Return the names of the elements of an array, in C order: ``name[i,j]``, or ``name`` of a scalar.
-
-    In text elements are counted from 1, as FMI does; Python's own indices of arrays and signals count from 0.
-
-    Examples
-    --------
-    >>> elements("motor_force", (2,))
-    ['motor_force[1]', 'motor_force[2]']
-    """
+    """Return the names of the elements of an array, in C order: ``name[i,j]``, or ``name`` of a scalar."""
+    # in text elements are counted from 1, as FMI does; Python's own indices of arrays and signals count from 0
     return [f"{name}[{','.join(str(i + 1) for i in index)}]" if index else name for index in np.ndindex(*shape)]
 
 
 def lay_out(sizes: Iterable[int], offset: int = 0) -> list[slice]:
-    """Return the slices of pieces of a flat vector, one after the other.
-
-    Examples
-    --------
-    >>> lay_out([2, 0, 1], offset=3)
-    [slice(3, 5, None), slice(5, 5, None), slice(5, 6, None)]
-    """
+    """Return the slices of pieces of a flat vector, one after the other."""
     ends = list(accumulate(sizes, initial=offset))
     return [slice(start, end) for start, end in pairwise(ends)]
 

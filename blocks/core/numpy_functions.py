@@ -31,7 +31,7 @@ class Place:
 
 
 class NumpyCall:
-    """A NumPy function of signals and of numbers, such as ``np.sum(…, axis=0)``; a value that can be pickled."""
+    """A NumPy function of signals (each a `Place`) and of numbers: ``np.sum(…, axis=0)``; it can be pickled."""
 
     def __init__(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]):
         self.function, self.args, self.kwargs = function, freeze(args), FrozenMapping(kwargs)

@@ -16,11 +16,8 @@ _lock = Lock()  # held by the caller that has set the limit; only that one resto
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit the BLAS libraries of NumPy and SciPy to one thread inside the ``with`` block, and restore them after it.
-
-    The limit belongs to the whole process: a caller that enters while it is set, nested or in another thread, leaves
-    it alone.
-    """
+    """Limit the BLAS libraries of NumPy and SciPy to one thread inside the ``with`` block, and restore them."""
+    # the limit is the whole process's: a caller that enters while it is set, nested or in another thread, leaves it
     if not _lock.acquire(blocking=False):
         yield
         return

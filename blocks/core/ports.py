@@ -180,7 +180,7 @@ class Output(Port):
         scalar and a vector is a vector.
     secondary : bool, optional
         True for an output that is read by name only (``saturation.excess``). It is recorded like any other, but a call
-        of the block neither unpacks into it nor stands for it.
+        of the block neither unpacks into it nor means it.
     """
 
     def __init__(

@@ -37,11 +37,9 @@ def documented(cls: type) -> frozenset[str]:
 
 
 class ShownMembers(ABCMeta):
-    """Class of classes whose ``help`` and ``dir`` list what they declare and what is `documented`; no special methods.
+    """Metaclass: ``help`` and ``dir`` list what a class declares and what is `documented`, no special methods."""
 
-    It derives from that of abstract classes, so that one may be a second base; ``isinstance`` is the plain one.
-    """
-
+    # It derives from that of abstract classes, so that one may be a second base; ``isinstance`` is the plain one.
     __instancecheck__ = type.__instancecheck__
     __subclasscheck__ = type.__subclasscheck__
 
@@ -53,11 +51,7 @@ class ShownMembers(ABCMeta):
 
 
 def missing_member(owner: object, name: str, kind: str, ways: Mapping[str, str]) -> AttributeError:
-    """Return the error of an attribute that an object doesn't have: what to write for it, or near names.
-
-    ``owner``: the object; what `dir` lists of it is known.
-    ``ways``: for names that users of other tools know: what to write.
-    """
+    """Return the error of an attribute that an object, "a run", doesn't have: the way to write it, or near names."""
     if hasattr(type(owner), name):
         object.__getattribute__(owner, name)  # a property that has failed: its own error
     if name.startswith("_"):  # Python and notebooks ask for such names: no one has typed them

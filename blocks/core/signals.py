@@ -211,10 +211,7 @@ def check_name(name: Any) -> str:
 
 
 def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
-    """Return the signal that ``value`` stands for: a signal, a call or block with one output, or a number.
-
-    A tuple, a list or an array of these, as `np.stack` and `np.hstack` make it, is one signal: their entries in a row.
-    """
+    """Return ``value`` as a signal: a signal, a call or block with one output, a number, or a list of these."""
     if isinstance(value, Wireable):
         return value._signal()
     if has_signals(value):
@@ -233,7 +230,7 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
 
 
 def _stack(values: Any, block: str, port: str) -> Signal:
-    """Return the signal with the entries of signals and numbers in a row."""
+    """Return the signal with the entries of signals and numbers in a row, as `np.stack` and `np.hstack` make it."""
     parts = list(values)
     if any(has_signals(part) and not isinstance(part, Wireable) for part in parts):
         raise WiringError(

@@ -29,7 +29,7 @@ class Source(Block):
         try:
             parse_unit(self.unit or "1")
         except UnitError as error:
-            error.at(block=self.label, port="unit")
+            error.at(port="unit")
             raise
 
     @property

@@ -134,13 +134,7 @@ def _safe(show: Callable[[Any], str]) -> Callable[[Any], str | None]:
 
 
 def cell_text(value: Any, longest: int = LONGEST) -> str:
-    """Return a value as the text of a cell, in one line, cut where it is long.
-
-    Examples
-    --------
-    >>> cell_text(1 / 3), cell_text(-0.0), cell_text(True), cell_text(None), cell_text((1.0, "a"))
-    ('0.333333', '0', 'yes', '', '1, a')
-    """
+    """Return a value as the text of a cell, in one line, cut where it is long: ``0.333333``, ``yes``, ``1, a``."""
     if value is None:
         return ""
     if isinstance(value, bool | np.bool_):
@@ -156,13 +150,7 @@ def cell_text(value: Any, longest: int = LONGEST) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text in one line, with characters that control a terminal or the direction of writing spelt out.
-
-    Examples
-    --------
-    >>> printable("a" + chr(10) + chr(0x202E) + "b") == "a" + chr(92) + "n" + chr(92) + "u202eb"
-    True
-    """
+    """Return a text in one line, with characters that control a terminal or the direction of writing spelt out."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else ascii(c)[1:-1] for c in text)
@@ -253,11 +241,5 @@ def _escape(text: str) -> str:
 
 
 def decibels(factor: float) -> str:
-    """Return a gain in dB, for a cell next to the factor; empty where it has none.
-
-    Examples
-    --------
-    >>> decibels(2.0), decibels(0.0), decibels(float("inf"))
-    ('6.02 dB', '', '')
-    """
+    """Return a gain in dB, for a cell next to the factor; empty where it has none, as of 0."""
     return f"{20 * math.log10(factor):.3g} dB" if 0.0 < factor < math.inf else ""

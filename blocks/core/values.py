@@ -18,11 +18,11 @@ from typing import Any, ClassVar, Self, dataclass_transform
 import numpy as np
 
 from ..names_of_other_tools import BY_POSITION, KEYWORDS, OF_ANY_BLOCK
-from .arguments import Kind, check_argument, shorten
+from .arguments import Kind, shorten
 from .brief import count_of
 from .control_systems import as_block
 from .docstrings import ParameterSignature, parameter_section, with_section
-from .errors import DefinitionError, ParameterError, near
+from .errors import DefinitionError, LoopwrightError, ParameterError, near
 from .frozen import freeze
 from .parameters import MISSING, ParameterSpec
 from .parameters import Array as Array
@@ -97,14 +97,21 @@ class Value:
                     port=name,
                 )
             object.__setattr__(self, name, convert(kwargs.get(name, spec.default), spec, who, name))
-        for name, kind, takes_none in cls._conditions:
-            value = self.__dict__[name]
-            if not (takes_none and value is None) and not kind.holds(value):
-                check_argument(value, kind, name, getattr(self, "label", cls.__name__), ParameterError)
-        self.check()
+        try:
+            for name, kind, takes_none in cls._conditions:
+                value = self.__dict__[name]
+                if not (takes_none and value is None) and not kind.holds(value):
+                    raise ParameterError(kind.complaint(name, value), port=name)
+            self.check()
+        except LoopwrightError as error:
+            error.at(block=getattr(self, "label", cls.__name__))
+            raise
 
     def check(self) -> None:
-        """Check conditions on several parameters together; override it and raise `ParameterError`."""
+        """Check conditions on several parameters together; override it and raise `ParameterError`.
+
+        The block's name is filled in: ``raise ParameterError("found …; expected …. Exchange them.", port="lower")``.
+        """
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -167,10 +174,8 @@ def _by_keyword(cls: type[Value], args: Sequence[Any], kwargs: Mapping[str, Any]
 
 
 def _order_by_position(cls: type[Value], count: int) -> list[str]:
-    """Return the parameters in the order in which people give that many by position.
-
-    It is the order of declaration, without a source's unit, where that has all required ones; else these come first.
-    """
+    """Return the parameters in the order in which people give that many by position."""
+    # the order of declaration, without a source's unit, where that has all required ones; else these come first
     known = BY_POSITION.get(cls.__name__, ())
     if 1 < count == len(known):
         return [*known, *(name for name in cls.parameter_specs if name not in known)]
@@ -194,10 +199,8 @@ def _instead_of(cls: type[Value], name: str) -> str:
 
 
 def identity(value: Any) -> Any:
-    """Return a hashable stand-in for a parameter value that is equal exactly when type and value are.
-
-    The type counts because equations may branch on it: ``1 == True``, but their traces differ.
-    """
+    """Return a hashable stand-in for a parameter value that is equal exactly when type and value are."""
+    # the type counts because equations may branch on it: 1 == True, but their traces differ
     if isinstance(value, Value):
         return type(value), tuple((k, identity(v)) for k, v in value.parameters.items()), value._content
     if isinstance(value, np.ndarray):
@@ -213,11 +216,9 @@ def identity(value: Any) -> Any:
 
 
 def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
-    """Bring one parameter value into its stored form and check it against its declaration.
-
-    Numbers become float, sequences of numbers read-only float64 arrays, integers stay integers where the declaration
-    says ``int``. Mappings, lists and sets become read-only copies.
-    """
+    """Bring one parameter value into its stored form and check it against its declaration."""
+    # Numbers become float, sequences of numbers read-only float64 arrays, integers stay integers where the declaration
+    # says int. Mappings, lists and sets become read-only copies.
 
     def error(found: str, expected: str) -> ParameterError:
         unit = f" in {spec.unit}" if spec.unit else ""

@@ -102,23 +102,19 @@ class Limited(Block):
 
     def check(self) -> None:
         """Refuse no limits, two kinds of limits, and limits that cross."""
-
-        def error(text: str, port: str) -> ParameterError:
-            return ParameterError(text, block=self.label, port=port)
-
         sides = {k: v for k, v in (("lower", self.lower), ("upper", self.upper)) if v is not None}
         if (self.limit is None) == (not sides):
             found = "no limit" if not sides else f"limit and {' and '.join(sides)}"
-            raise error(
-                f"found {found}; expected limit=… for ±limit, or lower=… or upper=… or both. Give these.", "limit"
+            raise ParameterError(
+                f"found {found}; expected limit=… for ±limit, or lower=… or upper=… or both. Give these.", port="limit"
             )
         if len(sides) == 2:
             check_shapes(**sides)
             if np.any(np.asarray(self.lower) >= np.asarray(self.upper)):
-                raise error(
+                raise ParameterError(
                     f"found lower={shorten(self.lower)} and upper={shorten(self.upper)}; expected lower below upper. "
                     "Exchange them, or move one.",
-                    "lower",
+                    port="lower",
                 )
 
     def clip(self, u: Array) -> Array:

@@ -111,7 +111,6 @@ class Wall(Block):
             raise ParameterError(
                 f"found normal={shorten(self.normal)} for point={shorten(self.point)}; expected a direction out of the "
                 "wall with as many entries as the point has. Give the normal, such as (0, −1).",
-                block=self.label,
                 port="normal",
             )
 

@@ -29,7 +29,7 @@ class History(State):
             return super().start_value(block, shapes)
         if len(shape) > 1:
             raise ShapeError(
-                f"found shape {shape}; expected a scalar or a vector. Give each row a block of its own.",
+                f"found shape {shape}; expected a scalar or a vector. Give each row its own block.",
                 block=block.label,
                 port=self.like,
             )
@@ -187,12 +187,10 @@ def _exact(time: float) -> Fraction:
 
 @lru_cache(maxsize=64)
 def _ladder(order: int) -> tuple[float, ...]:
-    """Return the entries of the Padé delay's ladder in s τ / 2: β² and the squares of the couplings.
-
-    The denominator is the reverse Bessel polynomial θ(z) of z = s τ / 2, the whole θ(−z) / θ(z). The quotient of the
-    lower and the higher of its even and odd part is the continued fraction β² / (z + c₁ / (z + c₂ / (z + …))), whose
-    entries come from Routh's table of θ, in fractions.
-    """
+    """Return the entries of the Padé delay's ladder in s τ / 2: β² and the squares of the couplings."""
+    # The denominator is the reverse Bessel polynomial θ(z) of z = s τ / 2, the whole θ(−z) / θ(z). The quotient of the
+    # lower and the higher of its even and odd part is the continued fraction β² / (z + c₁ / (z + c₂ / (z + …))), whose
+    # entries come from Routh's table of θ, in fractions.
     theta = [
         Fraction(factorial(order + k), factorial(order - k) * factorial(k) * 2**k) for k in range(order + 1)
     ]  # highest power first

@@ -187,7 +187,6 @@ class _Observer(Block):
             raise ParameterError(
                 f"found shape {np.shape(self.gain)}; expected {fits}: a row for each state, a column for each output. "
                 "Transpose it, or give another one.",
-                block=self.label,
                 port="gain",
             )
 

@@ -188,19 +188,17 @@ class IIR(Block):
             raise ParameterError(
                 f"found b of shape {shapes[0]} and a of shape {shapes[1]}; expected two lists of coefficients, or two "
                 "matrices with one row for each section.",
-                block=self.label,
                 port="b",
             )
         if np.any(np.asarray(self.a)[..., 0] == 0):
             raise ParameterError(
                 "found a first coefficient of zero; expected another number, since all are divided by it. Leave "
                 "leading zeros out of b and a.",
-                block=self.label,
                 port="a",
             )
         if max(shapes[0][-1], shapes[1][-1]) < 2:
             text = "found one coefficient each; expected two or more. Use Gain."
-            raise ParameterError(text, block=self.label, port="b")
+            raise ParameterError(text, port="b")
 
     @property
     def orders(self) -> list[int]:

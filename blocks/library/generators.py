@@ -105,7 +105,6 @@ class Chirp(Source):
             raise ParameterError(
                 f"found {first:g} and {last:g} Hz; expected two different frequencies above zero for a logarithmic "
                 "sweep. Take sweep='linear'.",
-                block=self.label,
                 port="start_frequency",
             )
 
@@ -264,7 +263,6 @@ class _Table(Source):
             raise ParameterError(
                 f"found values of shape {values} for {times[0]} times; expected shape ({times[0]},), or "
                 f"({times[0]}, n) for vectors of n entries.",
-                block=self.label,
                 port="values",
             )
 

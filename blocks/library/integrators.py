@@ -38,14 +38,12 @@ def check_limits(block: Any, start: str | None = None) -> None:
     if not low < high:
         raise ParameterError(
             f"found lower={low:g} and upper={high:g}; expected lower below upper. Exchange them.",
-            block=block.label,
             port="lower",
         )
     value = None if start is None else getattr(block, start)
     if start is not None and value is not None and not np.all((value >= low) & (value <= high)):
         raise ParameterError(
             f"found {value!r}; expected a value within the limits, {low:g} to {high:g}. Move it, or a limit.",
-            block=block.label,
             port=start,
         )
 
@@ -127,7 +125,7 @@ class LimitedIntegrator(_Limits, Block):
         """Refuse an integrator without limits, and limits that y can't keep."""
         if self.lower is None and self.upper is None:
             text = "found no limit; expected one or two. Give lower, upper or both, or use Integrator."
-            raise ParameterError(text, block=self.label)
+            raise ParameterError(text)
         check_limits(self, "initial_value")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:

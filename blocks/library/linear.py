@@ -69,7 +69,6 @@ class _StateSpace(Block):
                 raise ParameterError(
                     f"found shape {np.shape(getattr(self, name))}; expected {expected}. Write the matrices as nested "
                     "lists of rows.",
-                    block=self.label,
                     port=name,
                 )
         m, p = (int(np.prod(s, dtype=int)) for s in (np.shape(self.B)[1:], np.shape(self.C)[:-1]))
@@ -200,14 +199,12 @@ class _TransferFunction(Block):
         if a[0] == 0:
             raise ParameterError(
                 f"found {a.tolist()}; expected a first coefficient that is not zero. Leave leading zeros out.",
-                block=self.label,
                 port="denominator",
             )
         if len(b) > len(a):
             raise ParameterError(
                 f"found degree {len(b) - 1} over degree {len(a) - 1}; expected a proper transfer function. Add poles "
                 "(FilteredDerivative differentiates with one), or leave leading zeros out.",
-                block=self.label,
                 port="numerator",
             )
         check_names(self, input_names=1, output_names=1)

@@ -106,7 +106,6 @@ class Lookup1D(Block):
             raise ParameterError(
                 f"found shape {shape} for {n} breakpoints; expected ({n},), or ({n}, columns). Give one value, or one "
                 "row, for each breakpoint.",
-                block=self.label,
                 port="values",
             )
 
@@ -181,7 +180,6 @@ class Lookup2D(Block):
             raise ParameterError(
                 f"found shape {np.shape(self.values)}; expected {expected}, a row for each of rows and a column for "
                 "each of columns. Give the transpose, or other breakpoints.",
-                block=self.label,
                 port="values",
             )
 

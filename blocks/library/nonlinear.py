@@ -113,7 +113,6 @@ class Relay(Block):
             raise ParameterError(
                 f"found off_point={shorten(self.off_point)} above on_point={shorten(self.on_point)}; expected it at or "
                 "below. Exchange them; for a relay that turns on below a point, exchange its values as well.",
-                block=self.label,
                 port="off_point",
             )
 

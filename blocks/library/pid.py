@@ -138,24 +138,19 @@ class PID(Block):
 
     def check(self) -> None:
         """Refuse parameters that can't work together."""
-
-        def refuse(port: str, text: str) -> None:
-            raise ParameterError(text, block=self.label, port=port)
-
         if self.kd and self.filter_time is None:
             text = "found none; expected a filter for the derivative. Give filter_time, such as kd / (10 kp) in s."
-            refuse("filter_time", text)
+            raise ParameterError(text, port="filter_time")
         check_limits(self, None if self.tracking else "initial_output")
         if self.anti_windup == "clamping" and self.has_limits and (self.lower is None or self.upper is None):
             text = "found clamping without both limits; give lower and upper, or use 'back_calculation'."
-            refuse("anti_windup", text)
+            raise ParameterError(text, port="anti_windup")
         if self.tracking and self.anti_windup != "back_calculation":
             text = f"found {self.anti_windup!r}; expected 'back_calculation' with tracking. Leave it out."
-            refuse("anti_windup", text)
+            raise ParameterError(text, port="anti_windup")
         if self.tracks and self.tracking_time is None and self.ki and not self.kp / self.ki > 0:
-            refuse(
-                "tracking_time", f"kp / ki is {self.kp / self.ki:g} s; expected a positive time. Give tracking_time."
-            )
+            text = f"kp / ki is {self.kp / self.ki:g} s; expected a positive time. Give tracking_time."
+            raise ParameterError(text, port="tracking_time")
 
     @property
     def has_limits(self) -> bool:

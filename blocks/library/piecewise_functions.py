@@ -31,14 +31,10 @@ def wrap(s: Array, start: float, period: float) -> tuple[Array, Array]:
 
 
 def piecewise(breaks: np.ndarray, coefficients: np.ndarray, s: Array) -> Array:
-    """Evaluate K piecewise polynomials at s.
+    """Evaluate K piecewise polynomials at s, a number, an array or a traced scalar: shape (K,), then that of s.
 
     f_k(s) = Σ_j coefficients[i, k, j] (s − breaks[i])^j in the piece i with breaks[i] ≤ s < breaks[i + 1]; beyond the
     first and the last break the end pieces are continued. Derivatives of a trace with respect to s are exact.
-
-    ``breaks``: shape (pieces + 1,); ends of the pieces, rising.
-    ``coefficients``: shape (pieces, K, degree + 1); lowest power first.
-    Returns: shape (K,), followed by the shape of ``s`` where that is an array.
     """
     return jet(breaks, coefficients, s, 0)[0]
 
@@ -102,9 +98,6 @@ def bilinear(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, a: Array
 
     With the cell rows[i] ≤ a < rows[i + 1], columns[j] ≤ b < columns[j + 1] and α, β from 0 to 1 in it,
     f = (1 − α)(1 − β) v_ij + α (1 − β) v_(i+1)j + (1 − α) β v_i(j+1) + α β v_(i+1)(j+1). Derivatives are exact.
-
-    ``rows``, ``columns``: shape (n,) and (m,); ends of the cells, rising.
-    ``values``: shape (n, m); the table.
     """
     wide = len(columns)
     i: Any

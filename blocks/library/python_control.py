@@ -11,11 +11,8 @@ from ..core import Block, ParameterError, SampleTimeError, kinds, shorten
 
 
 def check_system(cls: type[Block], system: Any, kind: str) -> dict[str, Any]:
-    """Refuse anything but a system of this kind and of the block's time; return the keyword ``dt`` of a discrete one.
-
-    ``cls``: class of the block to be made; in discrete time if it is a `FixedSampleTime`. A system with an unspecified
-    time, ``dt=None``, may be either.
-    """
+    """Refuse all but a system of this kind and of the block's time; return the keyword ``dt`` of a discrete one."""
+    # a block is in discrete time if it is a `FixedSampleTime`; a system with dt=None may be in either
     import control
 
     wanted = getattr(control, kind)
@@ -91,13 +88,11 @@ def check_names(block: Any, **numbers: int) -> None:
         if names is not None and not kinds.names.holds(names):
             raise ParameterError(
                 f"found {shorten(names)}; expected a name for each of the {n}. Give texts.",
-                block=block.label,
                 port=parameter,
             )
         if names is not None and len(names) != n:
             raise ParameterError(
                 f"found {len(names)} names ({', '.join(map(str, names))}); expected {n}. Give one for each.",
-                block=block.label,
                 port=parameter,
             )
 

@@ -96,7 +96,7 @@ class Requirement(Block):
         """Refuse bounds that cross."""
         if self.lower is not None and self.upper is not None and self.lower > self.upper:
             text = f"found lower={self.lower:g} above upper={self.upper:g}; expected it at or below. Exchange them."
-            raise ParameterError(text, block=self.label, port="lower")
+            raise ParameterError(text, port="lower")
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]

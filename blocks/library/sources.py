@@ -62,14 +62,12 @@ class SmoothStep(Source):
             raise ParameterError(
                 f"found {len(levels)} levels, {len(starts)} start times and {len(durations)} durations; expected one "
                 "start time and one duration for each step between two levels.",
-                block=self.label,
                 port="levels",
             )
         if np.any(starts[1:] < (starts + durations)[:-1]):
             raise ParameterError(
                 "found a step that starts before the one before it ends; expected each to end first. Move start_times "
                 "apart.",
-                block=self.label,
                 port="start_times",
             )
 
@@ -111,7 +109,6 @@ class Step(Source):
         if np.shape(self.times) != np.shape(self.values) or np.any(np.diff(np.atleast_1d(self.times)) <= 0):
             raise ParameterError(
                 f"found times {self.times!r} and values {self.values!r}; expected rising times, one value each.",
-                block=self.label,
                 port="times",
             )
 
@@ -150,7 +147,6 @@ class Pulse(Source):
             raise ParameterError(
                 f"found {self.end_time - self.start_time:g} s between start and end; expected at least the two flanks, "
                 f"{2 * self.rise_time:g} s. Move end_time or shorten rise_time.",
-                block=self.label,
                 port="end_time",
             )
 

@@ -164,7 +164,6 @@ class Butterworth(ContinuousCascade):
             wanted = "one frequency" if count == 1 else "the lower and the upper frequency, such as (10.0, 20.0)"
             raise ParameterError(
                 f"found {shorten(self.cutoff)} for a {self.band}; expected {wanted}. Give it in Hz.",
-                block=self.label,
                 port="cutoff",
             )
 

@@ -68,8 +68,35 @@ class StateMachine(Block):
 
     def check(self) -> None:
         """Refuse wrong modes, conditions and transitions."""
-        _check_transitions(self)
-        _check_names(self)
+        if self.start is not None and self.start not in self.modes:
+            raise ParameterError(
+                f"found {self.start!r}, which is no mode. {near(self.start, self.modes)}", port="start"
+            )
+        given: Any = self.transitions
+        rows: tuple[Any, ...] = given if isinstance(given, tuple) and given else (given,)
+        for row in rows:
+            if not (isinstance(row, tuple) and len(row) == 3 and all(isinstance(part, str) for part in row)):
+                text = f"found {row!r}; expected {{(from, to): condition}}, three names for each. Write them so."
+                raise ParameterError(text, port="transitions")
+            for name in row[:2]:
+                if name not in self.modes:
+                    text = f"found {name!r}, which is no mode. {near(name, self.modes)}"
+                    raise ParameterError(text, port="transitions")
+            if row[0] == row[1]:
+                text = f"found one from {row[0]!r} to itself; expected another mode. Leave it out."
+                raise ParameterError(text, port="transitions")
+        # modes are outputs and conditions inputs: each name has to be a port's, and to mean one thing
+        taken = {"mode", "time_in_mode"}
+        for port, names in (("modes", self.modes), ("transitions", tuple(self.inputs))):
+            for name in names:
+                usable = isinstance(name, str) and name.isidentifier() and not keyword.iskeyword(name)
+                if not usable or name[0] == "_" or name in taken or hasattr(StateMachine, name) or hasattr(Call, name):
+                    raise ParameterError(
+                        f"found the name {name!r}; expected letters, digits and underscores, another name for each "
+                        "mode and condition, and none that a block or a call has already. Choose another.",
+                        port=port,
+                    )
+                taken.add(name)
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
@@ -137,42 +164,3 @@ class StateMachine(Block):
         """Return the mode after an event, and the time at which it was entered."""
         new = self._next_mode(x.active, u)
         return new, np.where(np.abs(new - x.active) < 0.5, x.since, t)
-
-
-def _error(machine: StateMachine, port: str, text: str) -> ParameterError:
-    return ParameterError(text, block=machine.label, port=port)
-
-
-def _check_transitions(machine: StateMachine) -> None:
-    """Refuse a start that is no mode, and transitions that don't lead from one mode to another."""
-    modes, transitions = machine.modes, machine.transitions
-    if machine.start is not None and machine.start not in modes:
-        raise _error(machine, "start", f"found {machine.start!r}, which is no mode. {near(machine.start, modes)}")
-    rows: tuple[Any, ...] = transitions if isinstance(transitions, tuple) and transitions else (transitions,)
-    for row in rows:
-        if not (isinstance(row, tuple) and len(row) == 3 and all(isinstance(part, str) for part in row)):
-            text = f"found {row!r}; expected {{(from, to): condition}}, three names for each. Write them so."
-            raise _error(machine, "transitions", text)
-        for name in row[:2]:
-            if name not in modes:
-                raise _error(machine, "transitions", f"found {name!r}, which is no mode. {near(name, modes)}")
-        if row[0] == row[1]:
-            text = f"found one from {row[0]!r} to itself; expected another mode. Leave it out."
-            raise _error(machine, "transitions", text)
-
-
-def _check_names(machine: StateMachine) -> None:
-    """Refuse names of modes and conditions that can't be ports, or have another meaning."""
-    taken = {"mode", "time_in_mode"}
-    conditions = dict.fromkeys(condition for _, _, condition in machine.transitions)
-    for port, names in (("modes", machine.modes), ("transitions", tuple(conditions))):
-        for name in names:
-            usable = isinstance(name, str) and name.isidentifier() and not keyword.iskeyword(name) and name[0] != "_"
-            if not usable or name in taken or hasattr(StateMachine, name) or hasattr(Call, name):
-                raise _error(
-                    machine,
-                    port,
-                    f"found the name {name!r}; expected letters, digits and underscores, another name for each mode "
-                    "and condition, and none that a block or a call has already. Choose another.",
-                )
-            taken.add(name)

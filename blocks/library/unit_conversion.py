@@ -37,7 +37,6 @@ class UnitConversion(Block):
         except (UnitError, TypeError, AttributeError) as error:
             raise ParameterError(
                 f"found {self.from_unit!r} and {self.to_unit!r}; expected two units of one dimension. {error}",
-                block=self.label,
                 port="to_unit",
             ) from None
         except (ValueError, IndexError):
@@ -45,7 +44,6 @@ class UnitConversion(Block):
         if not factor.size:
             raise ParameterError(
                 f"found {self.from_unit!r} and {self.to_unit!r}; expected as many units in both. Give these.",
-                block=self.label,
                 port="to_unit",
             )
 

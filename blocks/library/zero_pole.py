@@ -28,10 +28,7 @@ class UnpairedRootError(ValueError):
 
 
 def real_factors(roots: Sequence[complex]) -> list[list[complex]]:
-    """Return roots in groups that make real polynomials: conjugate pairs, and single real roots.
-
-    Raises `UnpairedRootError`: for a complex root without its conjugate.
-    """
+    """Return roots in groups that make real polynomials: conjugate pairs, and single real roots."""
     rest = sorted((complex(r) for r in roots), key=lambda r: (r.real, abs(r.imag), r.imag))
     groups: list[list[complex]] = []
     while rest:
@@ -50,11 +47,9 @@ def real_factors(roots: Sequence[complex]) -> list[list[complex]]:
 
 
 def sections(zeros: Sequence[complex], poles: Sequence[complex]) -> list[tuple[list[complex], list[complex]]]:
-    """Return zeros and poles of sections, each with at most as many zeros as poles.
-
-    Real poles are joined in the order of their size, so that at most one section is of first order. Each pair of
-    complex zeros, then each real zero, goes to the section with room that has the nearest pole.
-    """
+    """Return zeros and poles of sections, each with at most as many zeros as poles."""
+    # Real poles are joined in the order of their size, so that at most one section is of first order. Each pair of
+    # complex zeros, then each real zero, goes to the section with room that has the nearest pole.
     groups = real_factors(poles)
     reals = sorted((g[0] for g in groups if len(g) == 1), key=abs)
     joined = [g for g in groups if len(g) == 2]
@@ -169,7 +164,6 @@ class _ZeroPoleGain(Cascade):
             raise ParameterError(
                 f"found {len(self.zeros)} zeros and {len(self.poles)} poles; expected a pole, and no more zeros than "
                 "poles. Add poles, or use Gain where there are none.",
-                block=self.label,
                 port="poles",
             )
         check_names(self, input_names=1, output_names=1)

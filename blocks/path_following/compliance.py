@@ -152,12 +152,11 @@ class AdmittanceFilter(Block):
         """Refuse a damping that is given twice, or not at all."""
         if (self.damping is None) == (self.damping_ratio is None):
             found = "neither damping_ratio nor damping" if self.damping is None else "damping_ratio and damping"
-            raise ParameterError(f"found {found}; expected one of them. Give one.", block=self.label, port="damping")
+            raise ParameterError(f"found {found}; expected one of them. Give one.", port="damping")
         if self.stiffness == 0 and self.damping is None:
             raise ParameterError(
                 f"found stiffness=0 with damping_ratio={self.damping_ratio:g}; 2 ζ √(m k) would be zero. Give "
                 "damping=… in N.s/m, such as the value with the former stiffness.",
-                block=self.label,
                 port="damping",
             )
 

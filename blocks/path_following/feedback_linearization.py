@@ -77,7 +77,6 @@ class FeedbackLinearization(Block):
                 raise ParameterError(
                     f"{type(self.model).__name__} has no {text}; expected a PlanarModel that defines it, equation (2). "
                     "Write it.",
-                    block=self.label,
                     port="model",
                 )
 

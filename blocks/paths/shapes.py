@@ -205,7 +205,6 @@ class Line(Path):
         if np.array_equal(self.start, self.end):
             raise ParameterError(
                 f"found start and end both at {self.start.tolist()}; expected two different points. Move one of them.",
-                block=type(self).__name__,
                 port="end",
             )
 

@@ -38,27 +38,27 @@ class CubicSpline(Path):
         """Refuse too few points, points that coincide, and a curve whose speed vanishes."""
         points, least = np.asarray(self.points), 3 if self.closed else 2
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < least:
-            raise self._error(
+            raise ParameterError(
                 f"found an array of shape {np.shape(points)}; expected (N, 2) with at least {least} points for "
-                f"{'a closed' if self.closed else 'an open'} spline. Give one row (y, z) for each point."
+                f"{'a closed' if self.closed else 'an open'} spline. Give one row (y, z) for each point.",
+                port="points",
             )
         chords = self._chords()
         scale = float(np.max(np.ptp(points, axis=0)))
         for i in np.flatnonzero(chords <= 1e-12 * scale):
             j = (i + 1) % len(points)
             step = "Leave the last one out; a closed spline returns by itself." if j == 0 else "Leave one of them out."
-            raise self._error(
-                f"points {i} and {j} are both {points[i].tolist()}; expected consecutive points to differ. {step}"
+            raise ParameterError(
+                f"points {i} and {j} are both {points[i].tolist()}; expected consecutive points to differ. {step}",
+                port="points",
             )
         slowest, theta = self._find_slowest()
         if slowest < 1e-6:  # chord length makes the speed about 1
-            raise self._error(
+            raise ParameterError(
                 f"the spline's speed falls to {slowest:.3g} at theta = {theta:.6g} m, where it has a cusp or turns "
-                "back; expected a smooth curve. Move the points there, or add some."
+                "back; expected a smooth curve. Move the points there, or add some.",
+                port="points",
             )
-
-    def _error(self, text: str) -> ParameterError:
-        return ParameterError(text, block=type(self).__name__, port="points")
 
     def _chords(self) -> np.ndarray:
         points = np.vstack([self.points, self.points[:1]]) if self.closed else self.points

@@ -1,11 +1,14 @@
 """Layouts: where named arrays stand in a flat vector."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from loopwright.blocks.core.layout import Layout, elements
+from loopwright.blocks.core import read_time
+from loopwright.blocks.core.layout import Layout, elements, lay_out
 
 SHAPES = st.dictionaries(
     st.sampled_from(["a", "b.c", "d", "e", "f.g.h"]), st.lists(st.integers(0, 3), max_size=2).map(tuple), max_size=5
@@ -40,3 +43,8 @@ def test_what_is_laid_out_comes_one_after_the_other_as_numpy_ravels_it(shapes, o
 )
 def test_elements_have_names_that_count_from_1(shape, expected):
     assert elements("q", shape) == expected
+
+
+def test_slices_of_pieces_and_exact_times():
+    assert lay_out([2, 0, 1], offset=3) == [slice(3, 5), slice(5, 5), slice(5, 6)]
+    assert [*map(read_time, (0.0007, 1 / 44100, 0.1 + 0.2))] == [Fraction(7, 10000), Fraction(1, 44100), None]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import PID, Gain
-from loopwright.blocks.core import MOST_ROWS, Grid, Sheet, ShownAsTable, cell_text
+from loopwright.blocks.core import MOST_ROWS, Grid, Sheet, ShownAsTable, brief, cell_text, decibels, enumerate_some
 
 HOSTILE = '<script>alert(1)</script>"&\x1b[31m\u202e\n'
 
@@ -107,3 +107,11 @@ def test_a_block_that_is_half_built_is_shown(kind):
     assert repr(half).startswith(f"<{kind.__name__} that can't be shown")
     assert str(half)
     assert half._repr_html_() is None
+
+
+def test_short_texts_of_values():
+    values = 1 / 3, -0.0, True, None, (1.0, "a"), "a\n\u202eb"
+    assert [*map(cell_text, values)] == ["0.333333", "0", "yes", "", "1, a", "a\\n\\u202eb"]
+    assert [*map(decibels, (2.0, 0.0, float("inf")))] == ["6.02 dB", "", ""]
+    assert enumerate_some(["x", "y", "z"], most=2) == "x, y and 1 more"
+    assert brief("run of 'd'", "11 samples", "", then="run['y']") == "<run of 'd': 11 samples; run['y']>"

@@ -311,3 +311,18 @@ def test_a_unit_that_cannot_be_read_is_refused_when_the_source_is_made(source):
         source.replace(unit="meter/s", name="s")
     with pytest.raises(ParameterError, match=r"^s\.unit: found 3; expected a text"):
         source.replace(unit=3, name="s")
+
+
+def test_an_error_of_a_users_check_names_the_block_by_itself():
+    class Band(Block):
+        lower: float = parameter(default=0.0)
+        upper: float = parameter(default=1.0)
+
+        def check(self):
+            if not self.lower < self.upper:
+                raise ParameterError("found lower above upper; expected it below. Exchange them.", port="lower")
+
+    with pytest.raises(ParameterError, match=r"^narrow\.lower: found lower above upper"):
+        Band(upper=-1.0, name="narrow")
+    with pytest.raises(ParameterError, match=r"^band\.lower: found lower above upper"):
+        Band().replace(upper=-1.0)
