@@ -21,48 +21,26 @@ class BackgroundCode(Generic[Code]):
     """C code of a diagram's ticks, made while they are interpreted, as soon as the run is long enough for it.
 
     A run that is short never waits, and starts no compiler. The compiler is its own process.
-
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    write : callable
-        Returns its functions, to be compiled.
-    beside : callable, optional
-        Makes whatever else the run needs.
-
-    Attributes
-    ----------
-    ready : bool
-        Whether ``code`` is there.
-    code : TickCode, HybridCode or None
-        The code; None before, and where it can't replace interpreted ticks to the last bit.
-    failure : Exception or None
-        Why there is none: no compiler, one that fails, or a cache that does.
     """
 
     def __init__(
         self,
         flat: FlatDiagram,
         write: Callable[[], Sources[Code]],
-        beside: Callable[[], Any] = lambda: None,
+        prepare: Callable[[], Any] = lambda: None,
     ):
-        self._flat, self._write, self._beside = flat.origin, write, beside  # other numbers change no code
+        self._flat, self._write, self._prepare = flat.origin, write, prepare  # other numbers change no code
         self._sources: Sources[Code] | None = None
         self._thread: Thread | None = None
         self._over = False
         self.ready = False
-        self.code: Code | None = None
-        self.failure: Exception | None = None
+        self.code: Code | None = None  # none before, and where it can't replace interpreted ticks to the last bit
+        self.failure: Exception | None = None  # no compiler, one that fails, or a cache that does
 
     def look(self, spent: float, rest: float) -> None:
-        """Begin to make the code where it pays.
+        """Begin to make the code where it pays; ticks have taken ``spent`` s, and the rest may take ``rest`` s.
 
-        Parameters
-        ----------
-        spent, rest : float
-            Seconds that interpreted ticks have taken so far, and those that the ticks asked for still take. A run that
-            has taken long is taken to continue for as long.
+        A run that has taken long is taken to continue for as long.
         """
         if self._over:
             return
@@ -99,7 +77,7 @@ class BackgroundCode(Generic[Code]):
 
     def _load(self, sources: Sources[Code]) -> None:
         try:
-            self._beside()
+            self._prepare()
             self.code = sources.load()
         except (LoopwrightError, OSError) as error:  # the cache's folder may be gone, or hold what can't be loaded
             self._end(error)

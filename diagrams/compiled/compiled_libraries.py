@@ -23,24 +23,9 @@ _OURS = re.compile(r"[0-9a-f]{40}\.(size|so|dll|dylib)")
 def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> ctypes.CDLL:
     """Return the library of a C source, which is compiled unless the cache has it.
 
-    Parameters
-    ----------
-    source : str
-        The C text.
-    flags : tuple of str
-        Flags after those of every library.
-    known : str
-        Whatever else the code depends on, as the processor that flags ask for.
-
-    The key in the cache covers the source, the compiler with its version and flags, and the platform. A library is
-    loaded only from a folder that belongs to the user alone.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, it fails, or others can write to the folder.
-    FmuError
-        If the cache can't be written.
+    The key in the cache covers the source, the compiler with its version and ``flags`` (after those of every library),
+    ``known``, as the processor that flags ask for, and the platform. A library is loaded only from a folder that
+    belongs to the user alone.
     """
     library = _library_of(source, flags, known)
     with explain_cache_errors("compiled code can't be kept in the cache", CompilerError):
@@ -57,13 +42,7 @@ def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> 
 
 
 def is_kept(source: str, flags: tuple[str, ...] = ()) -> bool:
-    """Whether the cache has the library of a C source, so that it needs no compiler's run.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler.
-    """
+    """Whether the cache has the library of a C source, so that it needs no compiler's run."""
     return _is_whole(_library_of(source, flags))
 
 

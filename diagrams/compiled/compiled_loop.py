@@ -86,28 +86,14 @@ class _OwnSteps(ctypes.Structure):
 
 
 class Outcome(NamedTuple):
-    """Where and why the loop has returned.
+    """Where and why the loop has returned."""
 
-    Attributes
-    ----------
-    ticks, rows : int
-        Ticks that were gone through, and samples that were written.
-    reason : ReturnReason
-        The reason.
-    plant : int
-        The FMU that it is about, by its place.
-    stage : {0, 1, 2, 3, 4, 5}
-        What failed: setting the inputs, the step, reading the outputs; then those of FMUs that C does not call itself.
-    status : int
-        Status of that call.
-    """
-
-    ticks: int
-    rows: int
+    ticks: int  # that were gone through
+    rows: int  # samples that were written
     reason: ReturnReason
-    plant: int
-    stage: int
-    status: int
+    plant: int  # the FMU that it is about, by its place
+    stage: int  # setting inputs, the step, reading outputs; then as `plants_called_back`
+    status: int  # of that call
 
 
 class CompiledLoop:
@@ -269,7 +255,7 @@ class CompiledLoop:
             arguments[1][where] = before
             try:
                 solve()
-            except SimulationError:  # told where the run can't do without
+            except SimulationError:  # raised where the run can't do without
                 return 0
             return 1
 

@@ -4,7 +4,7 @@
 and the second at z > δ. A change in the declared direction fires the event.
 
 **Contact.** Zero itself is the border. An indicator that is exactly 0 at the start is in neither domain, and so is one
-that the jump of its own event leaves in contact by an impact: the jump changes continuous states of the block, and
+that the jump of its event leaves in contact by an impact: the jump changes continuous states of the block, and
 with them the motion of the indicator, leaves it on 0 or where the event found it, and the rates lead on beyond. The
 direction in which it leaves decides: down is falling, up is rising, and that fires the event if it is declared. So a
 ball that starts on the floor and moves down, or would fall, hits the floor at the start, one that moves up does not;
@@ -38,42 +38,23 @@ LATEST = 9
 
 
 class Domains:
-    """The domains of all indicators, and what is known of the events that have fired.
+    """The domains of all indicators, and what is known of the events that have fired; C writes all of the arrays.
 
-    C writes all of the arrays; `Watch` binds them.
-
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    time_scale : float
-        Shortest time in s within which a source changes.
-
-    Attributes
-    ----------
-    spacing : float
-        Longest time in s between two instants at which indicators are evaluated.
-    own : list of ndarray
-        Places of the states of each event's block among the continuous ones.
-    parts : dict of str to ndarray
-        By the names that C has for them: the ``domain`` of each indicator (1 above, -1 below, 0 on the border) and at
-        the ``start``; ``low`` and ``high``, between which one on the border stays; the ``slack`` beyond zero of one
-        that has just crossed it; ``size`` and ``rounding``, its largest value and its rounding errors in a step;
-        ``fresh``, whether an event has fired since the last step without one; ``latest``, ``counts`` and ``largest``:
-        last times of each event, their number, the longest interval; ``side``, ``stuck``, ``briefs``, ``brief_at``: a
-        rest in contact; ``recent`` and ``recent_fired``: rings of the last instants at which any has fired, and which
-        did.
-    fired_times : int
-        Number of instants at which events have fired.
-    sliding : tuple of bool
-        Whether events of a fixed step wait for its end, and whether one has fired there.
+    ``time_scale`` is the shortest time in s within which a source changes.
     """
 
     def __init__(self, flat: FlatDiagram, time_scale: float = math.inf):
         self._flat = flat
         n, events = len(flat.events), flat.events
+        # Longest time in s between two instants at which indicators are evaluated.
         self.spacing = min(float(flat.base), time_scale)
+        # Places of the states of each event's block among the continuous ones.
         self.own = [_continuous_states(flat, e) for e in events]
+        # By the names that C has for them: the domain of each indicator (1 above, -1 below, 0 on the border) and at the
+        # start; low and high, between which one on the border stays; the slack beyond zero of one that has just crossed
+        # it; its size, its rounding errors in a step; largest interval and counts of each event; side, stuck, briefs,
+        # brief_at: rest in contact; latest times of each event; fresh: one has fired since the last step without one;
+        # recent and recent_fired: rings of the last instants at which any has fired, and which did.
         names = ["domain", "start", "low", "high", "slack", "size", "rounding", "largest", "counts"]
         names += ["side", "stuck", "briefs", "brief_at"]
         self.parts = {name: np.zeros(n) for name in names}
@@ -82,6 +63,7 @@ class Domains:
         self.parts["brief_at"][:] = -np.inf
         self._hysteresis = np.array([e.hysteresis for e in events])
         self._gates = np.array([e.subsystem for e in events], dtype=bool)
+        # Sliding: events of a fixed step wait for its end, and one has fired there.
         self.fired_times, self.sliding = 0, (False, False)
         self._reported = set[int]()
         self.limits = EventLimits(events, self.parts)

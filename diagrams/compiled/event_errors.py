@@ -14,15 +14,7 @@ RECENT = 500
 
 
 class EventLimits:
-    """The errors of events that pile up.
-
-    Parameters
-    ----------
-    events : sequence of FlatEvent
-        All events.
-    parts : mapping of str to ndarray
-        What is kept of them; see `Domains`.
-    """
+    """The errors of events that pile up; ``parts`` are those of `Domains`."""
 
     def __init__(self, events: Sequence[FlatEvent], parts: Mapping[str, np.ndarray]):
         self.events, self._parts = events, parts

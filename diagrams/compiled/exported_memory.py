@@ -31,17 +31,11 @@ _STRUCTS: dict[type[ctypes.Structure], str] = {
     WatchStructure: "watch",
     HybridStructure: "hybrid",
 }
-_FIRST = 1 << 40  # stands for the address of the first function; no vector of a process is there
+_FIRST = 1 << 40  # in place of the address of the first function; no vector of a process is there
 
 
 class NamedCode(CodeOfFunctions):
-    """Functions that C finds by their names, in one unit with the loop: nothing is compiled or loaded.
-
-    Attributes
-    ----------
-    functions : list of casadi.Function
-        All functions that were asked for.
-    """
+    """Functions that C finds by their names, in one unit with the loop: nothing is compiled or loaded."""
 
     def __init__(self, library: ctypes.CDLL):
         super().__init__(library)
@@ -59,7 +53,7 @@ class NamedCode(CodeOfFunctions):
         return 0
 
     def name_of(self, address: int) -> str | None:
-        """Return the name of a function by the number that stands for its address."""
+        """Return the name of a function by the number in place of its address."""
         place = (address - _FIRST) // 16 - 1
         return str(self.functions[place].name()) if 0 <= place < len(self.functions) else None
 
@@ -67,18 +61,10 @@ class NamedCode(CodeOfFunctions):
 def read_memory(
     roots: Mapping[str, ctypes.Structure], vectors: Mapping[str, np.ndarray], kept: Iterable[Any], code: NamedCode
 ) -> LoopMemory:
-    """Return the memory of a loop.
+    """Return the memory of a loop: of structs and of vectors, by the names of their members.
 
-    Parameters
-    ----------
-    roots : mapping of str to Structure
-        Structs of the loop, by the names of their members.
-    vectors : mapping of str to ndarray
-        Vectors that have members of these names.
-    kept : iterable
-        Whatever lives as long as the structs: all that their pointers lead to.
-    code : NamedCode
-        The functions that pointers may lead to.
+    ``kept`` lives as long as the structs: all that their pointers lead to, but for functions, which are those of
+    ``code``.
     """
     return _Reader(vectors, kept, code).read(roots)
 

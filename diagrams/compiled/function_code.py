@@ -16,27 +16,14 @@ Code = TypeVar("Code")
 
 @dataclass(frozen=True, eq=False)
 class Sources(Generic[Code]):
-    """A diagram's functions, and their C code, which is written when it is asked for.
+    """A diagram's functions, and their C code, which is written when it is asked for."""
 
-    Attributes
-    ----------
-    writers : sequence of callable
-        Each writes the source of a library.
-    make : callable
-        Makes the code from these libraries, or from the virtual machine in the place of each.
-    operations : int
-        Operations in them.
-    exact : bool
-        Whether generated code has the bits of interpreted functions; see `TickCode`.
-    keep : callable
-        Keeps the generated code for the next run.
-    """
-
-    writers: Sequence[Callable[[], str]]
+    writers: Sequence[Callable[[], str]]  # each writes the source of a library
+    # from these libraries, or from the virtual machine in the place of each
     make: Callable[[Sequence[CodeOfFunctions]], Code]
     operations: int = 0
-    exact: bool = False
-    keep: Callable[[Code], None] = lambda code: None
+    exact: bool = False  # whether generated code has the bits of interpreted functions; see `TickCode`
+    keep: Callable[[Code], None] = lambda code: None  # keeps the generated code for the next run
 
     @cached_property
     def texts(self) -> list[str]:
@@ -44,38 +31,16 @@ class Sources(Generic[Code]):
         return [write() for write in self.writers]
 
     def is_compiled(self) -> bool:
-        """Whether the cache has all libraries, so that none has to be compiled.
-
-        Raises
-        ------
-        CompilerError
-            If there is no compiler.
-        """
+        """Whether the cache has all libraries, so that none has to be compiled."""
         return runtime_is_kept() and all(is_kept(text) for text in self.texts)
 
     def load(self, flags: tuple[str, ...] = (), known: str = "") -> Code:
-        """Return the generated code; libraries that the cache lacks are compiled. See `load_compiled`.
-
-        Raises
-        ------
-        CompilerError
-            If there is no compiler, or it fails.
-        FmuError
-            If the cache can't be written.
-        """
+        """Return the generated code; libraries that the cache lacks are compiled. See `load_compiled`."""
         load_runtime()  # if it can't be compiled, the run is interpreted
         code = self.make([GeneratedCode(load_compiled(text, flags, known)) for text in self.texts])
         self.keep(code)
         return code
 
     def on_machine(self) -> Code:
-        """Return the code for the virtual machine: nothing is compiled.
-
-        Raises
-        ------
-        CompilerError
-            If there are functions that need generated code; if the runtime library can't be had.
-        FmuError
-            If the cache can't be written.
-        """
+        """Return the code for the virtual machine: nothing is compiled."""
         return self.make([Machine(load_runtime())] * len(self.writers))

@@ -33,29 +33,15 @@ _CASADI = re.compile(r"\b(_?(?:casadi|CASADI)_)")
 
 @dataclass(frozen=True)
 class FusedPlant:
-    """A plant that a fused loop steps.
+    """A plant that a fused loop steps, and the value references of its ports that the loop sets and gets."""
 
-    Attributes
-    ----------
-    file : Path or None
-        Its FMU; None where its own functions are called.
-    inputs, outputs : tuple of int
-        Value references of the ports that the loop sets and gets.
-    """
-
-    file: Path | None
+    file: Path | None  # its FMU; None where its own functions are called
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
 
 
 def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
-    """Return a diagram whose FMUs, those of ours, are compiled for this processor, and messages about what was done.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or it fails.
-    """
+    """Return a diagram whose FMUs, those of ours, are compiled for this processor, and messages about what was done."""
     changes, kept = dict[str, object](), list[str]()
     for path, block in diagram.blocks.items():
         description = getattr(block, "description", None)
@@ -80,20 +66,7 @@ def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
 def compile_fused(
     flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants: Mapping[str, FusedPlant]
 ) -> TickCode:
-    """Compile the ticks at which these sets of clocks act, the plants' equations, and the loop over both as one unit.
-
-    Parameters
-    ----------
-    plants : mapping of str to FusedPlant
-        The plants that the loop steps, by path, in order.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or it fails.
-    FmuError
-        If the cache can't be written.
-    """
+    """Compile the ticks at which sets of clocks act, the plants' equations, and the loop over both as one unit."""
     flat, key = flat.origin, tuple(plants.values())
     known: dict[tuple[FusedPlant, ...], TickCode] = flat.made["fused ticks"]
     if key not in known or tuple(known[key].ticks) != tuple(acting):

@@ -18,83 +18,41 @@ PYTHON = -1
 
 @dataclass(frozen=True, eq=False)
 class PythonCall:
-    """A block that Python evaluates.
+    """A block that Python evaluates."""
 
-    Attributes
-    ----------
-    key : int
-        Key of its function in `Program.functions`.
-    arguments, results : tuple of slice
-        Where its columns are: the last argument in p, all others in v.
-    """
-
-    key: int
-    arguments: tuple[slice, ...]
+    key: int  # of its function in `Program.functions`
+    arguments: tuple[slice, ...]  # where its columns are: the last argument in p, all others in v
     results: tuple[slice, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class BlockCalls:
-    """The calls of blocks in a function, as runs of equal blocks.
+    """The calls of blocks in a function, as runs of equal blocks."""
 
-    Attributes
-    ----------
-    runs : ndarray of int32, shape (n, 3)
-        Kernel, number of blocks, and where their rows begin.
-    rows : ndarray of int32
-        Where the values are, block by block.
-    python : sequence of PythonCall
-        The blocks that Python evaluates; their rows are their places in it.
-    """
-
-    runs: np.ndarray
-    rows: np.ndarray
-    python: Sequence[PythonCall]
+    runs: np.ndarray  # int32, shape (n, 3): kernel, number of blocks, and where their rows begin
+    rows: np.ndarray  # int32: where the values are, block by block
+    python: Sequence[PythonCall]  # blocks that Python evaluates; their rows are their places in it
 
 
 @dataclass(frozen=True, eq=False)
 class TickTables:
-    """A tick as tables for kernels.
-
-    Attributes
-    ----------
-    calls : BlockCalls
-        The blocks.
-    memory : ndarray
-        v with its constants.
-    next : int
-        Where the next states are in v.
-    inputs, guards, made, taken : ndarray of int32
-        Where the inputs of plants, the guards and both sides of the algebraic loops stand.
-    log : int
-        Entries of the log without the residual.
-    residual : bool
-        Whether the log ends with the residual of algebraic loops.
-    unread : ndarray of int32
-        Entries of the log that may be no finite numbers, ascending.
-    """
+    """A tick as tables for kernels; places are entries of v, and int32."""
 
     calls: BlockCalls
-    memory: np.ndarray
-    next: int
+    memory: np.ndarray  # v with its constants
+    next: int  # where the next states begin
     inputs: np.ndarray
     guards: np.ndarray
-    made: np.ndarray
+    made: np.ndarray  # both sides of the algebraic loops
     taken: np.ndarray
-    log: int
-    residual: bool
-    unread: np.ndarray
+    log: int  # entries of the log without the residual
+    residual: bool  # whether the log ends with the residual of algebraic loops
+    unread: np.ndarray  # entries of the log that may be no finite numbers, ascending
 
 
 @without_collection
 def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> TickTables:
-    """Return the tables of a tick.
-
-    Parameters
-    ----------
-    kernels : mapping
-        The kernel of each kind of operation; functions without one are evaluated by Python.
-    """
+    """Return the tables of a tick; functions without a kernel are evaluated by Python."""
     program = tick.program
     places, memory, first = _place(tick)
     p_first = program.p.ids.start if isinstance(program.p.ids, range) else 0
@@ -124,24 +82,12 @@ def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> TickT
 
 @dataclass(frozen=True, eq=False)
 class PartTables:
-    """A function between ticks as tables for kernels.
-
-    Attributes
-    ----------
-    calls : BlockCalls
-        The blocks.
-    memory : ndarray
-        v with its constants.
-    where : ndarray of int32
-        Where the results are in v, one after the other.
-    lengths : tuple of int
-        Entries of each result.
-    """
+    """A function between ticks as tables for kernels."""
 
     calls: BlockCalls
-    memory: np.ndarray
-    where: np.ndarray
-    lengths: tuple[int, ...]
+    memory: np.ndarray  # v with its constants
+    where: np.ndarray  # int32: where the results are in v, one after the other
+    lengths: tuple[int, ...]  # entries of each result
 
 
 @without_collection

@@ -20,18 +20,8 @@ _FIRED = -1
 class HandedOver:
     """Blocks in model exchange, in a run that continues in C.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    blocks : mapping of str to ModelExchangeInstance
-        The blocks by path, loaded; one that a user has written has the members that Python needs alone.
-    evaluators : mapping of str to ModelExchangeEvaluator
-        Their evaluators, by which Python does what C can't.
-    report : callable
-        Called with events of the blocks' own.
-    count : callable
-        ``count(t, path, name)``: notes an event of time or of a step, and refuses those that pile up.
+    Evaluators do what C can't. ``report`` is called with events of the blocks' own; ``count(t, path, name)`` notes one,
+    and refuses those that pile up.
     """
 
     def __init__(

@@ -53,106 +53,49 @@ class Sign(IntEnum):
 
 
 class BrokenOff(NamedTuple):
-    """Where and why the loop has broken off.
-
-    Attributes
-    ----------
-    lost : Lost
-        What can't be done.
-    acting : frozenset of TickPattern, or None
-        At an instant: the clocks that act there; None where too seldom for code of its own.
-    method : str
-        Name of the method.
-    t_old, t : float
-        Begin and end of its last step, in s.
-    x_old, x : ndarray
-        The continuous states there.
-    trial_t, trial_x
-        The trial: its time in s, and the continuous states.
-    beyond : tuple of float and ndarray, or None
-        Time in s and continuous states of the last trial at which a rate was not finite.
-    step : float
-        Mean length of the last steps in s, of a run that does not get on.
-    edge, left : float
-        The end of the stretch in s, and the last time before it.
-    """
+    """Where and why the loop has broken off."""
 
     lost: Lost
-    acting: frozenset[TickPattern] | None
+    acting: frozenset[TickPattern] | None  # at an instant: the clocks that act; None where too seldom for code
     method: str
-    t_old: float
+    t_old: float  # begin and end of its last step, in s, and the continuous states there
     t: float
     x_old: np.ndarray
     x: np.ndarray
-    trial_t: float
+    trial_t: float  # the trial: its time in s, and the continuous states
     trial_x: np.ndarray
-    beyond: tuple[float, np.ndarray] | None
-    step: float
-    edge: float
+    beyond: tuple[float, np.ndarray] | None  # the last trial with a rate that was not finite
+    step: float  # mean length of the last steps in s, of a run that does not get on
+    edge: float  # the end of the stretch in s, and the last time before it
     left: float
 
 
 @dataclass(frozen=True, eq=False)
 class MethodOptions:
-    """A method of integration.
+    """A method of integration."""
 
-    Attributes
-    ----------
-    name : str
-        Its name: one of `METHODS`.
-    rtol : float
-        Relative tolerance.
-    atol : ndarray, shape (n,)
-        Absolute tolerances.
-    longest : float
-        Longest step in s; of a method of fixed step, its step.
-    """
-
-    name: str
+    name: str  # one of `METHODS`
     rtol: float
-    atol: np.ndarray
-    longest: float
+    atol: np.ndarray  # shape (n,)
+    longest: float  # longest step in s; of a method of fixed step, its step
 
 
 class Span(NamedTuple):
-    """Ticks and instants that are gone through in one call.
+    """Ticks and instants that are gone through in one call; times in s."""
 
-    Attributes
-    ----------
-    times : ndarray, shape (n + 1,)
-        Time from which they go, and of each of them, in s.
-    widths : ndarray, shape (n,)
-        Length of each, in s.
-    kinds : ndarray, shape (n,), of int32
-        Clocks that act at each of them, as places in `CompiledHybrid.kinds`.
-    lands : ndarray, shape (n,), of uint8
-        0 where the instant is recorded from a step beyond it.
-    beyond : float
-        Time of the first one after them that is landed on, in s.
-    edges, late : ndarray
-        Discontinuities of sources in s, and when they are seen at the instant itself.
-    steps : StepTable or None
-        Steps of the plants that end at each; None where all plants step at each of them.
-    stays : bool
-        Whether the first tick is where the run is, so that no plant steps to it.
-    """
-
-    times: np.ndarray
-    widths: np.ndarray
-    kinds: np.ndarray
-    lands: np.ndarray
-    beyond: float
-    edges: np.ndarray
-    late: np.ndarray
-    steps: StepTable | None = None
-    stays: bool = False
+    times: np.ndarray  # shape (n + 1,): from where they go, and of each of them
+    widths: np.ndarray  # shape (n,): length of each
+    kinds: np.ndarray  # shape (n,), int32: clocks that act, as places in `CompiledHybrid.kinds`
+    lands: np.ndarray  # shape (n,), uint8: 0 where the instant is recorded from a step beyond it
+    beyond: float  # time of the first one after them that is landed on
+    edges: np.ndarray  # discontinuities of sources
+    late: np.ndarray  # when these are seen at the instant itself
+    steps: StepTable | None = None  # of the plants, that end at each; None: all plants step at each
+    stays: bool = False  # the run is at the first tick, so that no plant steps to it
 
 
 class HybridOutcome(NamedTuple):
-    """Where and why the loop has returned; see `Outcome`.
-
-    ``t`` is the time in s that the states have reached.
-    """
+    """Where and why the loop has returned; see `Outcome`. ``t`` is the time in s that the states have reached."""
 
     ticks: int
     rows: int
@@ -426,12 +369,12 @@ class CompiledHybrid:
         self._hybrid.inside, self._hybrid.t = 0, t
 
     def hand_over_domains(self, domains: Domains) -> None:
-        """Let C continue with what is kept of events besides its arrays."""
+        """Let C continue with what is kept of events, apart from its arrays."""
         watch = self._hybrid.w
         watch.fired_times, (watch.sliding, watch.switched) = domains.fired_times, domains.sliding
 
     def take_back_domains(self, domains: Domains) -> None:
-        """Let Python continue with what is kept of events besides its arrays."""
+        """Let Python continue with what is kept of events, apart from its arrays."""
         watch = self._hybrid.w
         domains.fired_times, domains.sliding = int(watch.fired_times), (bool(watch.sliding), bool(watch.switched))
 
@@ -441,7 +384,7 @@ class CompiledHybrid:
         return Pile(self._hybrid.w.pile), int(self._hybrid.w.culprit), int(self._hybrid.w.piled)
 
     def own_event(self, place: int) -> str:
-        """Return the name of the last event of its own that an FMU in model exchange has had, by its place."""
+        """Return the name of the last event that an FMU in model exchange has had by itself, by its place."""
         assert self._exchange is not None
         return self._exchange.name_of_event(place)
 
@@ -547,13 +490,7 @@ class CompiledHybrid:
         return steps, rejected, self._hybrid.p.rates, self._hybrid.p.jacobians
 
     def run(self, span: Span, rows: np.ndarray) -> HybridOutcome:
-        """Go through ticks and instants between them, at most as many as there are rows to be written.
-
-        Parameters
-        ----------
-        rows : ndarray, shape (m, 1 + width)
-            Samples: their time in s, then their values.
-        """
+        """Go through ticks and instants between them, at most as many as ``rows``, each t in s, then values."""
         return self._go(self._run, span, rows, self._outcome)
 
     def run_between(self, span: Span, rows: np.ndarray) -> HybridOutcome:

@@ -40,24 +40,12 @@ FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fn
 
 @dataclass(frozen=True, eq=False)
 class HybridCode:
-    """The C functions of a diagram with continuous states, loaded.
+    """The C functions of a diagram with continuous states, loaded."""
 
-    Attributes
-    ----------
-    ticks : TickCode
-        Its ticks; that at which no clock acts is an instant between ticks.
-    between : mapping
-        Its other functions that there are, by name: ``"flow"``, ``"slope"``, ``"indicators"``, ``"jump"``.
-    steps : mapping
-        Addresses of steps that were made for its rates, by method.
-    judged : bool
-        Whether outputs are to be looked at after every step, as they may be non-finite while states are finite.
-    """
-
-    ticks: TickCode
-    between: Mapping[str, FunctionInC]
-    steps: Mapping[str, int] = field(default_factory=dict)
-    judged: bool = False
+    ticks: TickCode  # that at which no clock acts is an instant between ticks
+    between: Mapping[str, FunctionInC]  # by name: flow, slope, indicators, jump, driven
+    steps: Mapping[str, int] = field(default_factory=dict)  # addresses of steps that were made for its rates, by method
+    judged: bool = False  # outputs may be non-finite after a step though states are finite
 
     def hand_over(self, to: HybridCode) -> None:
         """Let generated code take the place of the virtual machine wherever these functions are bound."""
@@ -91,23 +79,9 @@ def has_delays(flat: FlatDiagram) -> bool:
 def compile_hybrid(
     flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool, fuse: bool = False
 ) -> HybridCode:
-    """Compile the functions of a diagram with continuous states.
+    """Compile the functions of a diagram with continuous states, with the derivative of its rates where ``stiff``.
 
-    Parameters
-    ----------
-    acting : sequence of frozenset
-        Sets of clocks that act together at some tick.
-    stiff : bool
-        Whether the derivative of the rates is needed, too.
-    fuse : bool, default False
-        Compile it for the processor of this machine, with products and sums fused.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, it fails, or a function is too large for it.
-    FmuError
-        If the cache can't be written.
+    With ``fuse`` it is compiled for the processor of this machine, with products and sums fused.
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
     known: dict[tuple[Any, ...], HybridCode] = flat.made["generated code between ticks"]
@@ -118,13 +92,7 @@ def compile_hybrid(
 
 
 def interpret_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridCode:
-    """Return the functions of a diagram with continuous states for the virtual machine; see `compile_hybrid`.
-
-    Raises
-    ------
-    CompilerError
-        If there is only generated code of them, or the runtime library can't be had.
-    """
+    """Return the functions of a diagram with continuous states for the virtual machine; see `compile_hybrid`."""
     return hybrid_sources(flat, acting, stiff=stiff).on_machine()
 
 
@@ -146,11 +114,6 @@ def write_hybrid(
     `FlatDiagram.by_block`, are grouped, so that the compiler sees each kind of block once. The derivative of the rates
     is computed by differences then. Diagrams with algebraic loops between ticks are expanded, and so are all with
     ``straight``.
-
-    Raises
-    ------
-    CompilerError
-        If a function is too large for a compiler.
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
     grouped = flat.by_block and not flat.active_loops(NONE) and not straight

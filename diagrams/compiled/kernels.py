@@ -41,52 +41,24 @@ _FIRST_LINE = re.compile(r"static\s+int\s+(casadi_f\d+)\(")
 
 @dataclass(frozen=True)
 class Kernel:
-    """A function over a table.
-
-    Attributes
-    ----------
-    place : int
-        Its place in the table of kernels.
-    columns : tuple of (bool, int)
-        Columns of its table: of an argument (False) or a result (True), by number.
-    """
+    """A function over a table, at a place in the table of kernels."""
 
     place: int
-    columns: tuple[tuple[bool, int], ...]
+    columns: tuple[tuple[bool, int], ...]  # of an argument (False) or a result (True), by number
 
 
 @dataclass(frozen=True, eq=False)
 class Kernels:
-    """The kernels of a diagram where C finds them.
+    """The kernels of a diagram where C finds them."""
 
-    Attributes
-    ----------
-    of : mapping
-        The kernel of each kind of operation.
-    of_python : mapping
-        CasADi functions of the blocks that Python evaluates, by key; they have no kernel.
-    generated : int or None
-        Address of the table of generated kernels; None where the virtual machine evaluates them.
-    programs : sequence of BlockProgram
-        The programs of the virtual machine, by place.
-    """
-
-    of: Mapping[int | str, Kernel]
-    of_python: Mapping[int, Any]
-    generated: int | None = None
-    programs: Sequence[BlockProgram] = ()
+    of: Mapping[int | str, Kernel]  # by kind of operation
+    of_python: Mapping[int, Any]  # functions of blocks that Python evaluates, which have no kernel
+    generated: int | None = None  # address of the table of generated kernels; None: programs
+    programs: Sequence[BlockProgram] = ()  # of the virtual machine, by place
 
 
 class BlockKinds:
-    """The kinds of blocks in some functions of a large diagram, and the operations on single values.
-
-    Attributes
-    ----------
-    exact : bool
-        Whether all of them are operations on scalars, as they are interpreted.
-    operations : int
-        Operations of one evaluation of each.
-    """
+    """The kinds of blocks in some functions of a large diagram, and the operations on single values."""
 
     def __init__(self, flat: FlatDiagram, programs: Iterable[Program]):
         opaque = {id(flat.blocks.of(path, names)) for path, names in flat.order.steps if flat.table.blocks[path].opaque}
@@ -97,6 +69,7 @@ class BlockKinds:
             every |= program.functions
         self._opaque = {key: f for key, f in every.items() if key in opaque}
         self._functions = {key: f for key, f in every.items() if key not in opaque}
+        # Whether generated code has the bits of interpreted functions: all are operations on scalars.
         self.exact = all(function.is_a("SXFunction") for function in self._functions.values())
         self.operations = sum(function.n_instructions() for function in self._functions.values())
         self._on_machine: Kernels | None = None
@@ -127,13 +100,7 @@ class BlockKinds:
 
     @property
     def source(self) -> str:
-        """C code of all kernels, with their table.
-
-        Raises
-        ------
-        CompilerError
-            For a function that needs more memory than a kernel has.
-        """
+        """C code of all kernels, with their table."""
         return self._generated[0]
 
     @cached_property

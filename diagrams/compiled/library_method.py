@@ -22,21 +22,11 @@ _Library = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int32)
 
 @dataclass(frozen=True)
 class StepFailure:
-    """A step that a library could not take.
+    """A step that a library could not take."""
 
-    Attributes
-    ----------
-    error : BaseException
-        The error of the solver, or what was raised in a call.
-    beyond : tuple of float and ndarray, or None
-        Time in s and states of the last trial at which a rate was not finite.
-    edge, left : float
-        The end of the stretch in s, and the last time before it, at which trials there are evaluated.
-    """
-
-    error: BaseException
-    beyond: tuple[float, np.ndarray] | None
-    edge: float
+    error: BaseException  # of the solver, or what was raised in a call
+    beyond: tuple[float, np.ndarray] | None  # time in s and states of the last trial with a rate that was not finite
+    edge: float  # the end of the stretch in s, and the last time before it
     left: float
 
 
@@ -45,22 +35,8 @@ class LibraryMethod:
 
     Its dense output is a polynomial from the start of each step, x + Σ cₖ uᵏ, which C evaluates: the coefficients of
     BDF come from its backward differences, those of LSODA from its Nordsieck array, those of CVODE from derivatives at
-    the start. The method's own polynomial has the same degree, so that both are equal but for rounding.
-
-    Parameters
-    ----------
-    name : str
-        A method of `METHODS` whose steps a library takes.
-    rtol, longest : float
-        Relative tolerance, and longest step in s.
-    atol : ndarray, shape (n,)
-        Absolute tolerances.
-    names : sequence of str
-        Names of the n states, for messages.
-    problem : ProblemStructure
-        The differential equation, as C knows it.
-    method : MethodStructure
-        The method, as C knows it.
+    the start. The method's own polynomial has the same degree, so that both are equal but for rounding. ``names`` are
+    those of the states, for messages.
     """
 
     def __init__(

@@ -32,21 +32,11 @@ class BlockProgramStructure(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class MachineProgram:
-    """A function as a list of runs; see `machine.c`.
-
-    Attributes
-    ----------
-    runs : int
-        Number of runs.
-    code : ndarray of int32
-        The runs, one behind the other.
-    start : ndarray, shape (n,)
-        The values before the first evaluation: constants, and zeros.
-    """
+    """A function as a list of runs, one behind the other; see `machine.c`."""
 
     runs: int
-    code: np.ndarray
-    start: np.ndarray
+    code: np.ndarray  # int32
+    start: np.ndarray  # the values before the first evaluation: constants, and zeros
 
     def bind(self) -> tuple[ctypes.Structure, np.ndarray]:
         """Return the program as C knows it, and memory for one use of it at a time; valid as long as both live."""
@@ -55,24 +45,12 @@ class MachineProgram:
 
 @dataclass(frozen=True, eq=False)
 class BlockProgram:
-    """A block's function as a program for several blocks at a time.
+    """A block's function as a program for several blocks at a time."""
 
-    Attributes
-    ----------
-    program : MachineProgram
-        The program; each value has ``width`` places.
-    width : int
-        Blocks at a time.
-    columns : ndarray of int32
-        Of each argument, then of each result: its entry of a block's row in the table; -1 for none.
-    arguments : int
-        Number of arguments; the last one is the parameters.
-    """
-
-    program: MachineProgram
+    program: MachineProgram  # each value has ``width`` places
     width: int
-    columns: np.ndarray
-    arguments: int
+    columns: np.ndarray  # int32: of each argument, then result, its entry of a row; -1: none
+    arguments: int  # their number; the last one is the parameters
 
     def bind(self) -> tuple[BlockProgramStructure, np.ndarray]:
         """Return it as C knows it, and memory for one use of it at a time; valid as long as both live."""
@@ -93,16 +71,8 @@ def make_program(function: Any, names: Sequence[str], width: int = 1) -> Machine
     """Return a CasADi function of scalar operations as a program; None if it has one that the machine doesn't have.
 
     Every operation writes to a place that nothing else is written to. So operations may be done in any order in which
-    the operands come first; those of one kind are done together where that is possible.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        A function of scalar operations.
-    names : sequence of str
-        Names of the machine's operations, by their codes.
-    width : int, default 1
-        Places of each value.
+    the operands come first; those of one kind are done together where that is possible. ``names`` are those of the
+    machine's operations, by their codes; each value has ``width`` places.
     """
     codes = {getattr(ca, f"OP_{name}"): code for code, name in enumerate(names)}
     place: dict[int, int] = {}  # of the last value that was written to a place of CasADi's memory

@@ -24,28 +24,13 @@ class NewtonStructure(ctypes.Structure):
 
 @dataclass(frozen=True)
 class NewtonOptions:
-    """Newton's method for the algebraic loops of a tick.
+    """Newton's method for the algebraic loops of a tick."""
 
-    Attributes
-    ----------
-    where : sequence of int
-        Entries of x that hold the values of the loops.
-    tolerance, rounding : float
-        Residuals, relative to 1 + the size of the values: up to the one a loop counts as solved, up to the other it is
-        solved no further.
-    singular : float
-        Least singular value of the derivative that surely determines the values, relative to 1 + the loop's gain.
-    iterations, halvings : int
-        Steps, and halvings of a step, at most.
-    solver : callable
-        ``solver(t, x, call, r, J)`` returns Python's function that solves the loops where C can't: with the vectors t
-        and x, and ``call``, which evaluates the mismatch r and its derivative J.
-    """
-
-    where: Sequence[int]
-    tolerance: float
-    rounding: float
-    singular: float
+    where: Sequence[int]  # entries of x that hold the values of the loops
+    tolerance: float  # residual, relative to 1 + the size of the values, at which a loop counts as solved
+    rounding: float  # residual below which it is solved no further
+    singular: float  # least singular value that determines the values, relative to 1 + the loop's gain
     iterations: int
     halvings: int
+    # solver(t, x, call, r, J): Python's, where C can't; call evaluates r and J
     solver: Callable[..., Callable[[], None]]

@@ -70,13 +70,7 @@ class _Apart(ctypes.Structure):
 
 
 class RemotePlants:
-    """The FMUs of a loop that are in their own processes, or that Python steps.
-
-    Attributes
-    ----------
-    structure : ctypes.Structure
-        What they have in common, as C knows it.
-    """
+    """The FMUs of a loop that are in their own processes, or that Python steps."""
 
     def __init__(self) -> None:
         self.structure = _Apart()
@@ -99,7 +93,7 @@ class RemotePlants:
         return ctypes.addressof(made)
 
     def add_quiet(self, quiet: QuietStep) -> int:
-        """Take what tells when C takes a step that may be more than its calls, and return its address."""
+        """Take what says when C takes a step that may be more than its calls, and return its address."""
         watched, sloped = (np.ascontiguousarray(v, dtype=np.int64) for v in (quiet.watched, quiet.sloped))
         line = None if quiet.line is None else at(quiet.line)
         behind = quiet.slopes if quiet.line is None else quiet.line[2 + sloped.size :]
@@ -179,13 +173,7 @@ class RemotePlants:
 
     @contextmanager
     def guard(self) -> Iterator[None]:
-        """Let C make the requests meanwhile.
-
-        Raises
-        ------
-        FmuProcessError
-            If a process has ended before.
-        """
+        """Let C make the requests meanwhile."""
         self.structure.until = self.structure.late = 0
         for process, structure in self._all:
             process.check_alive("its next step")
@@ -220,13 +208,7 @@ _STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, ctypes.c_double, ctypes.c
 
 
 class PythonSteps(CalledBack):
-    """Steps of plants that Python takes at the request of C.
-
-    Attributes
-    ----------
-    step : int
-        Address of the function by which C asks for one; it returns 1 if C can't continue from there.
-    """
+    """Steps of plants that Python takes at the request of C: ``step`` returns 1 if C can't continue from there."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -249,10 +231,7 @@ _WAIT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
 class LateReplies(CalledBack):
     """Python's wait for replies that C has not seen in time: the process is slow, or hangs, or has ended.
 
-    Attributes
-    ----------
-    wait : int
-        Address of the function by which C asks for a reply; it returns 0 if it never comes.
+    ``wait`` is the address of the function by which C asks for a reply; it returns 0 if it never comes.
     """
 
     def __init__(self) -> None:

@@ -38,22 +38,11 @@ def put_in_order(source: str) -> str:
 
 
 def reorder(source: str, name: str, limit: str) -> str | None:
-    """Return a function of CasADi's C code once more, with its operations in the order in which they can begin.
+    """Return a function of `write_functions` once more, with its operations in the order in which they can begin.
 
-    Parameters
-    ----------
-    source : str
-        C code of one function, as `write_functions` returns it.
-    name : str
-        Name of the new function, ``static int name(const double **arg, double **res)``. It returns 0, or 1 without
-        having written anything, where an argument of a sine or a cosine is not below a limit.
-    limit : str
-        This limit, as C text.
-
-    Returns
-    -------
-    str or None
-        None where the function has other statements than assignments.
+    The new function, ``static int name(const double **arg, double **res)``, returns 0, or 1 without having written
+    anything, where an argument of a sine or a cosine is not below ``limit``, a C text. None where it isn't made of
+    assignments alone.
     """
     found = BODY.search(source)
     lines = None if found is None else _order(found[2])

@@ -12,15 +12,7 @@ from .compiled_libraries import is_kept, load_compiled
 
 @lru_cache(maxsize=1)
 def load_runtime() -> ctypes.CDLL:
-    """Return the runtime library: that of the installation, else that of the cache, where it is compiled once.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or it fails.
-    FmuError
-        If the cache can't be written.
-    """
+    """Return the runtime library: that of the installation, else that of the cache, where it is compiled once."""
     try:
         return ctypes.CDLL(str(installed_runtime()))
     except OSError:

@@ -20,15 +20,7 @@ _CASADI = re.compile(r"\b(_?(?:casadi|CASADI)_)")
 
 
 def write_steps(rates: Any, where: Sequence[int]) -> str:
-    """Return the C code of steps for a differential equation; empty where it is too large to be inlined.
-
-    Parameters
-    ----------
-    rates : casadi.Function
-        The rates by (t, x, w, p).
-    where : sequence of int
-        Entries of x that are integrated.
-    """
+    """Return the C code of steps for rates by (t, x, w, p); empty where they are too large to be inlined."""
     n = len(where)
     if not (0 < n <= _MOST_STATES and rates.is_a("SXFunction") and rates.n_instructions() <= _MOST_OPERATIONS):
         return ""

@@ -90,7 +90,7 @@ class StageStructure(ctypes.Structure):
 
 
 class OwnEvent(NamedTuple):
-    """An event of a block's own: its time in s, block and name, and the states before and after it."""
+    """An event that a block has had by itself: its time in s, block and name, and the states before and after it."""
 
     t: float
     path: str
@@ -114,18 +114,9 @@ def find_obstacle(block: Any) -> str | None:
 
 
 class NativeModelExchange:
-    """Blocks in model exchange, as C knows them in a run.
+    """Blocks in model exchange, as C knows them in a run; ``first`` is where the states of each begin among all.
 
-    Parameters
-    ----------
-    blocks : mapping
-        The blocks by path, loaded.
-    first : mapping
-        Where the states of each are in the vector of all.
-    width : int
-        Number of all states.
-    by_python : callable
-        Returns, for a stage and its vectors, the function that does for C what it can't.
+    ``by_python`` returns, for a stage and its vectors, the function that does for C what it can't.
     """
 
     def __init__(
@@ -275,7 +266,7 @@ class NativeModelExchange:
         return self._each[self.paths.index(path)]
 
     def name_of_event(self, place: int) -> str:
-        """Return the name of the last event of its own that a block has had, by its place."""
+        """Return the name of the last event that a block has had by itself, by its place."""
         return OWN_EVENTS[self._each[place].event]
 
     def take_warnings(self) -> list[tuple[str, str, float]]:
@@ -290,13 +281,7 @@ class NativeModelExchange:
         return sorted(found, key=lambda one: one[2])
 
     def failure(self) -> CallFailure:
-        """Return the call that has failed.
-
-        Raises
-        ------
-        FmuProcessError
-            If the process of an FMU has ended.
-        """
+        """Return the call that has failed; raises `FmuProcessError` if the process of an FMU has ended."""
         self._late.check()
         self.called.check()
         o = self.structure

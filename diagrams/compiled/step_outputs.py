@@ -56,7 +56,7 @@ class _Computed:
     made_of: list[tuple[int, int, tuple[int, ...]]] = field(default_factory=list)
     results: set[int] = field(default_factory=set)
 
-    def carried(self) -> set[int]:
+    def required(self) -> set[int]:
         """Return the values without which no result is finite."""
         found = set(self.results)
         for value, op, arguments in reversed(self.made_of):
@@ -83,7 +83,7 @@ def may_fail_at_steps(flat: FlatDiagram) -> bool:
 
     known = dict[Any, int]()
     suspects = _trace(tick, moves, known).suspects
-    return bool(suspects and suspects - _trace(flow, moves, known).carried())
+    return bool(suspects and suspects - _trace(flow, moves, known).required())
 
 
 def _trace(function: Any, moves: Callable[[int, int], bool], known: dict[Any, int]) -> _Computed:

@@ -29,32 +29,20 @@ LOOP_OVER_TICKS = "loopwright_run"
 
 @dataclass(frozen=True, eq=False)
 class TickCode:
-    """The C functions of a diagram's ticks, loaded.
+    """The C functions of a diagram's ticks, by the clocks that act, loaded.
 
-    Attributes
-    ----------
-    ticks : mapping
-        The ticks, by the clocks that act.
-    exact : bool
-        Whether all bits are those of an interpreted run. Tables and large matrix products are compiled in another form
-        than they are interpreted in: there, signs of zeros may differ. Algebraic loops of more than `EXACT_LOOP`
-        values are solved with another rounding.
-    library : CDLL
-        The library, which is loaded as long as this lives.
-    loops : mapping
-        Equations of the algebraic loops, by the clocks that act, where there are some.
-    run_ticks : function or None
-        The C function that goes over ticks; None for the one that all diagrams share.
-    notes : tuple of str
-        What a run reports of its code.
+    ``exact`` says whether all bits are those of an interpreted run. Tables and large matrix products are compiled in
+    another form than they are interpreted in: there, signs of zeros may differ. Algebraic loops of more than
+    `EXACT_LOOP` values are solved with another rounding.
     """
 
     ticks: Mapping[frozenset[TickPattern], FunctionInC]
     exact: bool
-    library: ctypes.CDLL
+    library: ctypes.CDLL  # loaded as long as this lives
+    # equations of algebraic loops, where there are some
     loops: Mapping[frozenset[TickPattern], FunctionInC] = field(default_factory=dict)
-    run_ticks: Any = None
-    notes: tuple[str, ...] = ()
+    run_ticks: Any = None  # goes over ticks; None for the one that all diagrams share
+    notes: tuple[str, ...] = ()  # what a run reports of its code
 
 
 def find_obstacle(flat: FlatDiagram) -> str | None:
@@ -70,13 +58,6 @@ def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -
     Small ones are one function of scalar operations, in which the values of one block are used by the next without a
     memory in between. Large ones, and those with blocks that are no scalar operations, are grouped: one function for
     each kind of block, called in a loop over all blocks of this kind. Their code knows no numbers and no wiring.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or it fails.
-    FmuError
-        If the cache can't be written.
     """
     flat = flat.origin  # other numbers change no code
     code: TickCode | None = flat.made["ticks"].get("generated")
@@ -84,13 +65,7 @@ def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -
 
 
 def interpret_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode:
-    """Return the ticks at which these sets of clocks act for the virtual machine; see `compile_ticks`.
-
-    Raises
-    ------
-    CompilerError
-        If there is only generated code of them, or the runtime library can't be had.
-    """
+    """Return the ticks at which these sets of clocks act for the virtual machine; see `compile_ticks`."""
     flat = flat.origin
     known, sources = flat.made["ticks"].get("interpreted", ((), None))
     if sources is None or [*known] != [*acting]:
@@ -161,13 +136,7 @@ def compile_loops(
 
 
 def check_size(function: Any) -> None:
-    """Refuse a function that is too large to be compiled as a whole.
-
-    Raises
-    ------
-    CompilerError
-        If it is.
-    """
+    """Refuse a function that is too large to be compiled as a whole."""
     if (count := function.n_instructions()) > LARGEST:
         raise CompilerError(
             f"a function of the diagram has {count} operations; at most {LARGEST} are compiled, as a compiler takes "
@@ -206,13 +175,7 @@ def _write_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) 
 
 
 class GroupedTicks:
-    """Ticks as runs of equal blocks, with tables that are made once for kernels.
-
-    Parameters
-    ----------
-    programs : mapping
-        The ticks, by the clocks that act.
-    """
+    """Ticks as runs of equal blocks, with tables that are made once for kernels."""
 
     def __init__(self, programs: Mapping[frozenset[TickPattern], TickProgram]):
         self._programs = programs

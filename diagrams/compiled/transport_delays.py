@@ -167,18 +167,8 @@ def _same(a: float, b: float) -> bool:
 class NativeDelays:
     """Transport delays bound to the numbers of a run, whose memory of past inputs C reads and writes.
 
-    Parameters
-    ----------
-    past : Delays
-        The memory.
-    driven : TickStructure
-        Evaluates the inputs z at a trial.
-    z : ndarray
-        Its result.
-    here, trial : ndarray
-        The vector w of the run, and that of trials.
-    tolerances : pair of float
-        Relative and absolute tolerance with which inputs are kept.
+    ``driven`` evaluates the inputs z at a trial, whose outputs of delays are in ``trial``; ``here`` are those of the
+    run. Inputs are kept within ``tolerances``, relative and absolute.
     """
 
     def __init__(

@@ -11,53 +11,27 @@ from ..wiring import find_cyclic_parts
 
 
 class Pin(NamedTuple):
-    """A pin of a block, by its port, or of a subsystem, by the output that makes the signal.
+    """A pin of a block, by its port, or of a subsystem, by the output that makes the signal."""
 
-    Attributes
-    ----------
-    port : str
-        The block's port; at a subsystem, the port of the maker.
-    maker : str
-        At a subsystem, the path of the block that makes the signal; empty at a block.
-    control : bool
-        Whether it enables or triggers the subsystem.
-    """
-
-    port: str
-    maker: str = ""
-    control: bool = False
+    port: str  # at a subsystem, that of the maker
+    maker: str = ""  # at a subsystem, the path of the block that makes the signal
+    control: bool = False  # it enables or triggers the subsystem
 
 
 @dataclass(eq=False)
 class Node:
-    """A block, a subsystem, a pin on a subsystem's border, or a wire on its way through a layer.
-
-    Attributes
-    ----------
-    ins, outs : dict
-        Height of every pin below the upper edge.
-    side : int
-        -1 for an input pin of the subsystem whose inside is laid out, 1 for an output pin, else 0.
-    plant : bool
-        Whether loops are closed behind it.
-    controller : int, optional
-        Rank among the nodes ahead of which loops are closed; None for a node that isn't one.
-    lane : bool
-        Whether it is a wire on its way through a layer.
-    loose : bool
-        Whether it has no inputs, or is a wire from such a node.
-    """
+    """A block, a subsystem, a pin on a subsystem's border, or a wire on its way through a layer."""
 
     key: str
     width: float
     height: float
-    ins: dict[Pin, float] = field(default_factory=dict)
+    ins: dict[Pin, float] = field(default_factory=dict)  # height of every pin below the upper edge
     outs: dict[Pin, float] = field(default_factory=dict)
-    side: int = 0
-    plant: bool = False
-    controller: int | None = None
-    lane: bool = False
-    loose: bool = False
+    side: int = 0  # -1 for an input pin of the subsystem whose inside is laid out, 1 for an output pin
+    plant: bool = False  # loops are closed behind it
+    controller: int | None = None  # rank among the nodes ahead of which loops are closed
+    lane: bool = False  # it is a wire on its way through a layer
+    loose: bool = False  # it has no inputs, or is a wire from such a node
     layer: int = 0
     x: float = 0.0
     y: float = 0.0
@@ -77,19 +51,10 @@ def cut_loops(
 ) -> list[tuple[str, str]]:
     """Return the wires that close no loop.
 
-    Parameters
-    ----------
-    keys : list of str
-        The nodes.
-    pairs : list of pairs
-        The wires.
-    plants : set of str
-        Nodes behind which loops are closed. What is between one and a controller, such as the integrator of a speed,
-        stays on its right: such a loop is closed ahead of the controller.
-    controllers : mapping of str to int
-        Nodes ahead of which other loops are closed, so that a plant is on the right of them, with their ranks: the
-        lowest is taken, and of these one that the loop is entered at: in a cascade the outermost one, which has the
-        reference. Without any it is the node at which the loop is entered.
+    Loops are closed behind ``plants``. What is between one and a controller, such as the integrator of a speed, stays
+    on its right: such a loop is closed ahead of the controller. Others are closed ahead of ``controllers``, so that a
+    plant is on the right of them: of the lowest rank, and of these one that the loop is entered at: in a cascade the
+    outermost one, which has the reference. Without any it is the node at which the loop is entered.
     """
     left = [pair for pair in dict.fromkeys(pairs) if pair[0] != pair[1]]
     place = {key: i for i, key in enumerate(keys)}
@@ -195,13 +160,7 @@ def _count_crossings(layers: list[list[Node]], links: Sequence[Link]) -> int:
 
 
 def place_layers(layers: list[list[Node]], links: Sequence[Link], *, gap: Callable[[Node, Node], float]) -> None:
-    """Set ``y`` of all nodes so that wires are straight where they can be.
-
-    Parameters
-    ----------
-    gap : callable
-        Room between two nodes, the upper one first.
-    """
+    """Set ``y`` of all nodes so that wires are straight where they can be; ``gap(upper, lower)`` is room between."""
     left, right = _neighbours(links)
     for layer in layers:
         y = 0.0

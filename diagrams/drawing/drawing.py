@@ -26,7 +26,7 @@ PAGE = """<!doctype html>
 @media (prefers-color-scheme: dark) {{ html {{ background: #14191f; color: #e4e9ee }} }}</style>
 {body}</html>
 """
-"""A page of its own."""
+"""A page for the drawing alone."""
 
 
 @explain_calls

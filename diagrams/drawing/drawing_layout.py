@@ -20,27 +20,15 @@ Point = tuple[float, float]
 
 @dataclass(eq=False)
 class Net:
-    """A wire from an output to all its consumers; each end is a node's key and a pin.
-
-    Attributes
-    ----------
-    label : float
-        Width of the name at its source.
-    below : float
-        Height at which it runs back, where it closes a loop.
-    runs : list of list of (x, y)
-        Its polylines.
-    dots : list of (x, y)
-        Its branching points.
-    """
+    """A wire from an output to all its consumers; each end is a node's key and a pin."""
 
     key: str
     source: tuple[str, Pin]
     sinks: list[tuple[str, Pin]]
-    label: float = 0.0
-    below: float = 0.0
-    runs: list[list[Point]] = field(default_factory=list)
-    dots: list[Point] = field(default_factory=list)
+    label: float = 0.0  # width of the name at its source
+    below: float = 0.0  # height at which it runs back, where it closes a loop
+    runs: list[list[Point]] = field(default_factory=list)  # its polylines
+    dots: list[Point] = field(default_factory=list)  # its branching points
 
 
 End = tuple[Node, float]
@@ -72,15 +60,7 @@ class _Part:
 
 
 def arrange(nodes: Sequence[Node], nets: Sequence[Net]) -> tuple[float, float]:
-    """Place nodes and route nets, in place, and return the width and height of the drawing.
-
-    Parameters
-    ----------
-    nodes : list of Node
-        The nodes; their order decides where nothing else does.
-    nets : list of Net
-        The nets between pins of the nodes.
-    """
+    """Place nodes and route nets, in place, and return the width and height; ties go by the order of the nodes."""
     by_key = {node.key: node for node in nodes}
     pairs = [(net.source[0], sink[0]) for net in nets for sink in net.sinks]
     _assign_layers(nodes, pairs)

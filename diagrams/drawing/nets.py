@@ -19,18 +19,10 @@ class Border(Enum):
 
 
 class PinPlace(NamedTuple):
-    """An end of a wire inside a subsystem: at a block, at an inner subsystem, or at the subsystem's own border.
-
-    Attributes
-    ----------
-    path : str
-        Path of the block or subsystem.
-    border : Border, optional
-        The side of the border; None where the wire ends at a block or an inner subsystem.
-    """
+    """An end of a wire inside a subsystem: at a block, at an inner subsystem, or at the subsystem's own border."""
 
     path: str
-    border: Border | None = None
+    border: Border | None = None  # the side of the border; None at a block or an inner subsystem
 
     def key(self, pin: Pin) -> str:
         """Return the key of the node at this place: on a border every pin is its own node."""

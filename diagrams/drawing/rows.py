@@ -43,19 +43,9 @@ class _Row:
 
 
 def arrange_in_rows(nodes: Sequence[Node], nets: Sequence[Net], limit: float) -> tuple[float, float]:
-    """Place nodes and route nets, in place, in one row if that is narrow enough, else in several.
+    """Place nodes and route nets, in place, in rows; return the width and height.
 
-    Parameters
-    ----------
-    nodes, nets
-        As `arrange` takes them.
-    limit : float
-        Width in pixels above which the drawing is broken into rows. A single layer can be wider.
-
-    Returns
-    -------
-    (float, float)
-        Width and height.
+    It is one row up to a width of ``limit`` pixels. A single layer can be wider.
     """
     size = arrange(nodes, nets)
     inner = [node for node in nodes if not node.side]
@@ -116,7 +106,7 @@ def _stack(nodes: Sequence[Node], nets: Sequence[Net], row_of: dict[str, int]) -
         if source.side:
             at_border.append((source, rows[home], net, -1))
         at_border += [(node, rows[home], net, 1) for node in border]
-        # in each row such a net is a part of its own, from or to a pin at the row's border; `_connect` joins the parts
+        # in each row such a net is a separate part, from or to a pin at the row's border; `_connect` joins the parts
         across = [row for row in behind if row != home]
         for row in sorted({home, *across}):
             here = [(node.key, pin) for node, pin in ends if not node.side and row_of[node.key] == row]

@@ -73,24 +73,12 @@ Curve = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Symbol:
-    """The inside of a block: a line of text, a fraction, or a curve.
+    """The inside of a block: a line of text, a fraction, or a curve."""
 
-    Attributes
-    ----------
-    text : str
-        The text, or the numerator.
-    below : str
-        The denominator; empty for a line of text.
-    curve : tuple of (x, y)
-        Points of a curve, each from -1 to 1, y upwards.
-    axes : bool
-        Whether the curve has axes through the middle, as a characteristic has.
-    """
-
-    text: str = ""
-    below: str = ""
-    curve: Curve = ()
-    axes: bool = False
+    text: str = ""  # or the numerator
+    below: str = ""  # the denominator; empty for a line of text
+    curve: Curve = ()  # points, each from -1 to 1, y upwards
+    axes: bool = False  # it has axes through the middle, as a characteristic has
 
     @property
     def size(self) -> tuple[float, float]:

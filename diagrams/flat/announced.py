@@ -20,13 +20,7 @@ from .flat_diagram import FlatDiagram
 
 
 class Times:
-    """Instants that are known from the start.
-
-    Parameters
-    ----------
-    times : mapping
-        The instants in s, each with whether the block still has the value from before at the instant itself.
-    """
+    """Known instants in s, each with whether the block still has the value from before at the instant itself."""
 
     def __init__(self, times: Mapping[float, bool]):
         self.times = sorted(times)

@@ -14,14 +14,9 @@ from .program import Cells
 class BlockFunctions:
     """The traced equations of a diagram's blocks, and functions of parts of them.
 
-    An instant may evaluate some outputs of a block before its other ones: these have a separate function.
-
-    Parameters
-    ----------
-    traced : mapping
-        The traced equations of every block, by path. Blocks of equal structure share theirs.
-    inlined : bool
-        Write functions that are no scalar operations out in place of calls, so that lookups in them are found.
+    An instant may evaluate some outputs of a block before its other ones: these have a separate function. Blocks of
+    equal structure share their traces. ``inlined`` writes out functions that are no scalar operations, so that lookups
+    are found.
     """
 
     def __init__(self, traced: Mapping[str, Traced], *, inlined: bool = False):
@@ -29,13 +24,7 @@ class BlockFunctions:
         self._parts: dict[tuple[int, tuple[str, ...]], Any] = {}
 
     def of(self, path: str, names: tuple[str, ...]) -> Any:
-        """Return the CasADi function (t, x, one column per input, p) of a block that evaluates only ``names``.
-
-        Parameters
-        ----------
-        names : tuple of str
-            Outputs, `NEXT` and `GUARDS`, in this order.
-        """
+        """Return the function (t, x, one column per input, p) of some outputs of a block, `NEXT` and `GUARDS`."""
         trace = self.traced[path]
         every = (*trace.outputs, NEXT, GUARDS)
         if names == every:
@@ -47,13 +36,7 @@ class BlockFunctions:
         return self._parts[key]
 
     def of_events(self, path: str, name: str) -> Any:
-        """Return the CasADi function of the indicators of a block's events, or its jump, with p as the last argument.
-
-        Parameters
-        ----------
-        name : {"indicators", "jump"}
-            Which of the two.
-        """
+        """Return the function of a block's ``"indicators"`` or ``"jump"``, with p as the last argument."""
         trace = self.traced[path]
         function = getattr(trace, name)
         if name == "indicators":

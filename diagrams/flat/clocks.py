@@ -41,22 +41,7 @@ EVERY = TickPattern()
 
 
 def ticks_after(patterns: Sequence[TickPattern], k: int, last: int, count: int) -> np.ndarray:
-    """Return the first ``count`` ticks of some patterns after tick ``k``, up to ``last``, which ends them.
-
-    Parameters
-    ----------
-    patterns : sequence of TickPattern
-        The patterns; at least one.
-    k, last : int
-        Ticks.
-    count : int
-        Number of ticks, at least 1.
-
-    Returns
-    -------
-    ndarray, shape (n,), of int64
-        Ticks in order; empty if ``k`` is ``last``.
-    """
+    """Return the first ``count`` ticks (int64) of some patterns after tick ``k``, up to ``last``, which ends them."""
     first = [pattern.after(k) for pattern in patterns]
     every = min(pattern.every for pattern in patterns)
     beyond = min(last, min(first) + count * every)  # the fastest has as many by then, or another one begins earlier
@@ -73,19 +58,10 @@ def in_order(clocks: frozenset[TickPattern] | set[TickPattern]) -> tuple[TickPat
 
 
 class ClockSets:
-    """Numbers of sets of clocks that act together.
+    """Numbers of sets of clocks that act together; ``rest`` is that of all others.
 
     The sets are a tree that branches at each clock: to sets in which it acts, and to those in which it doesn't. So
     there may be any number of clocks.
-
-    Parameters
-    ----------
-    clocks : sequence of TickPattern
-        All clocks.
-    sets : mapping of frozenset of TickPattern to int
-        The number of each set, from 0 on.
-    rest : int, default -1
-        The number of all others.
     """
 
     def __init__(self, clocks: Sequence[TickPattern], sets: Mapping[frozenset[TickPattern], int], rest: int = -1):

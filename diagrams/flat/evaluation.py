@@ -88,29 +88,7 @@ def evaluate(
 
 
 class Instant:
-    """The values of all blocks at an instant; see `evaluate`.
-
-    Attributes
-    ----------
-    values : dict
-        The flat columns of all outputs, by port.
-    returned : dict
-        Outputs of the blocks at ports that are tapped, as they were before the tap.
-    new : dict
-        Next states of the blocks that act, by path.
-    rates : dict
-        Time derivatives of the states of continuous blocks, by path.
-    held : dict
-        Outputs that are held from now on, by dotted port.
-    gates : dict
-        Values of their control that enabled and triggered subsystems remember from now on, by path.
-    guards : list
-        Columns that must be positive.
-    mismatch : list
-        For each torn port of an algebraic loop: what came round, and what was taken.
-    provisional : set of str
-        Equations of the block at hand that are evaluated again, when more of its inputs are there.
-    """
+    """The values of all blocks at an instant, as flat columns; see `evaluate`."""
 
     def __init__(
         self,
@@ -132,15 +110,15 @@ class Instant:
         self.layout, self.functions, self.acting = layout, functions, acting
         self.t, self.x, self.w, self.p, self.fired = t, x, w, p, fired
         self.opened, self.taps, self.apart, self.kept = opened, taps, apart, kept
-        self.values: dict[tuple[str, str], Any] = {}
-        self.returned: dict[tuple[str, str], Any] = {}
-        self.new: dict[str, Any] = {}
-        self.rates: dict[str, Any] = {}
-        self.held: dict[str, Any] = {}
-        self.gates: dict[str, Any] = {}
-        self.guards: list[Any] = []
-        self.mismatch: list[tuple[Any, Any]] = []
-        self.provisional: set[str] = set()
+        self.values: dict[tuple[str, str], Any] = {}  # flat columns of all outputs, by port
+        self.returned: dict[tuple[str, str], Any] = {}  # outputs at tapped ports, as they were before the tap
+        self.new: dict[str, Any] = {}  # next states of the blocks that act, by path
+        self.rates: dict[str, Any] = {}  # by path
+        self.held: dict[str, Any] = {}  # outputs that are held from now on, by dotted port
+        self.gates: dict[str, Any] = {}  # of enabled and triggered subsystems: what they remember of their control
+        self.guards: list[Any] = []  # must be positive
+        self.mismatch: list[tuple[Any, Any]] = []  # of each torn port: what came round, and what was taken
+        self.provisional: set[str] = set()  # equations of the block at hand that are evaluated again, later
         self._open: dict[str, Any] = {}
         self._events = {(e.path, e.name): i for i, e in enumerate(layout.events)}
 
@@ -192,7 +170,7 @@ class Instant:
                     self._output(path, name, column, gate, torn)
         for subsystem in layout.gates.slices:
             if self._acts(subsystem):
-                self.is_open(subsystem)  # one without blocks of its own remembers, too
+                self.is_open(subsystem)  # one without blocks remembers, too
         for path in layout.starts.slices:  # blocks of another rate than the subsystem that resets them
             if not acts[path] and any(self._resets(subsystem) for subsystem in layout.around[table.subsystem_of[path]]):
                 self.new[path] = self._state(path)
@@ -226,13 +204,7 @@ class Instant:
         return wire is None or (wire.block, wire.port) in self.values
 
     def events_of(self, path: str, name: str, *more: Any) -> Any:
-        """Return the column of a block's `INDICATORS`, or of its states after a `JUMP`.
-
-        Parameters
-        ----------
-        *more : column
-            Further arguments of the equation: which of the block's events fire.
-        """
+        """Return the column of a block's `INDICATORS`, or of its states after a `JUMP`; ``more``: which events fire."""
         trace = self.functions.traced[path]
         t, state, inputs, p = self._arguments(path, {q: self.source(path, q) for q in trace.inputs})
         if path in self.layout.apart:

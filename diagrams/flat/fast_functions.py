@@ -28,13 +28,9 @@ def share_terms(function: Any, name: str | None = None) -> Any:
 def speed_up(function: Any, *, simplify: bool = True) -> Any:
     """Return a function in the form that is evaluated fastest: scalar operations.
 
-    Where a block looks up a table, or multiplies a large matrix, it is returned unchanged.
-
-    Parameters
-    ----------
-    simplify : bool
-        Simplify the operations of all blocks together, such as a sum with a zero: this may change the sign of a zero,
-        and rounding where a value is added and subtracted again. Else the results are those of the blocks, one by one.
+    Where a block looks up a table, or multiplies a large matrix, it is returned unchanged. To ``simplify`` the
+    operations of all blocks together, such as a sum with a zero, may change the sign of a zero, and rounding where a
+    value is added and subtracted again. Else the results are those of the blocks, one by one.
     """
     if has_large_product(function):
         return function

@@ -248,7 +248,7 @@ class FlatDiagram(FlatLayout):
     def made(self) -> defaultdict[str, dict[Any, Any]]:
         """Return what others have made of its functions to run them, by kind and by their own keys.
 
-        It stands here, and not in tables of theirs with weak keys: what is made often refers to the diagram, which such
+        It is here, and not in tables of theirs with weak keys: what is made often refers to the diagram, which such
         a table would then keep for ever.
         """
         return defaultdict(dict)

@@ -90,21 +90,11 @@ def trace_tick(
 
 @dataclass(frozen=True, eq=False)
 class GuardedTick:
-    """A tick with each of its guards, for C that is read.
+    """A tick with each of its guards, for C that is read."""
 
-    Attributes
-    ----------
-    function : casadi.Function
-        ``(t, x, w, p) -> (x_next, log, guards)``.
-    evaluated : frozenset of str
-        The blocks that act.
-    guards : tuple of (str, str)
-        Block and name of each guard.
-    """
-
-    function: Any
-    evaluated: frozenset[str]
-    guards: tuple[tuple[str, str], ...]
+    function: Any  # (t, x, w, p) -> (x_next, log, guards)
+    evaluated: frozenset[str]  # the blocks that act
+    guards: tuple[tuple[str, str], ...]  # block and name of each
 
 
 @without_collection
@@ -186,10 +176,7 @@ def trace_output(layout: FlatLayout, functions: BlockFunctions, port: tuple[str,
 def trace_flow(layout: FlatLayout, functions: BlockFunctions, made: TracedRates | None = None) -> Schedule:
     """Return ``(t, x, w, p) -> dx``: the rates of the entries of x that are integrated.
 
-    Parameters
-    ----------
-    made : TracedRates, optional
-        The rates, where a tick at which no clock acts has been traced, and no block has an evaluator.
+    ``made`` are they, where a tick at which no clock acts has been traced, and no block has an evaluator.
     """
     if made is not None:
         return trace_schedule("flow", made[0], lambda apart: {"dx": made[1]})

@@ -27,12 +27,8 @@ from .plant_ticks import find_plant_ticks, takes_any_step
 class StateLayout(Layout):
     """Where the states of blocks are: by the block's path, and within a block by the state's name.
 
-    Attributes
-    ----------
-    slices, shapes : dict
-        All states of a block together: a slice, and the shape (n,), by path.
-    of_block : dict
-        By path, the layout of a block's states in the same vector: ``of_block["pid"].slices["integral"]``.
+    A slice and the shape (n,) are those of all states of a block together; ``of_block["pid"].slices["integral"]`` is
+    one.
     """
 
     of_block: dict[str, Layout]
@@ -190,7 +186,7 @@ class FlatLayout:
 
     @cached_property
     def in_model_exchange(self) -> tuple[str, ...]:
-        """Paths of the blocks in model exchange: a run evaluates their equations, and they have events of their own."""
+        """Paths of the blocks in model exchange: a run evaluates their equations, and they have their own events."""
         return tuple(path for path in sorted(self.apart) if self.table.blocks[path].in_model_exchange)
 
     @cached_property

@@ -31,20 +31,10 @@ def flatten(
     name: str = "",
     between: bool = False,
 ) -> FlatDiagram:
-    """Flatten a checked diagram.
+    """Flatten a checked diagram; ``orders`` are those of evaluation at an instant, and of initialization.
 
-    Parameters
-    ----------
-    orders : pair of Order
-        Orders of evaluation at an instant, and of initialization.
-    step : Fraction, optional
-        Seconds between two ticks; required where there is no other clock.
-    asked : bool, optional
-        Whether ``step`` was asked for, and is not that of the clocks; by default it was if it is given.
-    name : str
-        The diagram's name, for errors.
-    between : bool, default False
-        Whether outputs are evaluated between ticks though nothing happens there: all sampled ones are held then.
+    ``step``, in s, is required where there is no other clock; ``asked``: a user has, by default if it is given.
+    ``between``: outputs are evaluated between ticks though nothing happens there, so that all sampled ones are held.
     """
     base, clocks = _clocks(table, step, name)
     traced, blocks = checked.traced, table.blocks
@@ -122,15 +112,7 @@ def flatten(
 
 
 def renumber(flat: FlatDiagram, blocks: Mapping[str, Block]) -> FlatDiagram:
-    """Return a flattened diagram with other numbers; it shares the functions of ``flat``.
-
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The flattened diagram.
-    blocks : mapping of str to Block
-        Blocks by path that differ from those of ``flat`` in numbers alone: their traces are the same ones.
-    """
+    """Return a flattened diagram whose blocks have other numbers alone: traces and functions are the same ones."""
     table = flat.table.with_blocks(blocks)
     p, x0 = flat.p.copy(), flat.x0.copy()
     write_numbers(flat, blocks, p, x0)

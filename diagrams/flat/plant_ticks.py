@@ -60,14 +60,9 @@ def suggested_step(plant: Block) -> float | None:
 def find_plant_ticks(
     table: Structure, clocks: Mapping[str, TickPattern], base: Fraction, *, every: bool
 ) -> dict[str, tuple[TickPattern, ...]]:
-    """Return the ticks at which each plant steps, by path.
+    """Return the ticks at which each plant steps, by path; ``clocks`` are those of sampled subsystems.
 
-    Parameters
-    ----------
-    clocks : mapping
-        For every subsystem that is sampled: at which ticks it acts.
-    every : bool
-        Whether a step was asked for: then plants without their own communication step step at every tick.
+    With ``every``, a step was asked for: then plants without their own communication step step at every tick.
     """
     plants = stepped_blocks(table)
     own = {path: step for path, plant in plants.items() if (step := own_step(plant)) is not None}

@@ -38,46 +38,23 @@ class Cells:
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """A call of a block's function, or an operation on single values.
+    """A call of a block's function, or an operation on single values."""
 
-    Attributes
-    ----------
-    kernel : int or str
-        Key of the function in `Program.functions`, or one of the operations on single values.
-    arguments, results : tuple of range
-        The values that it takes and makes, one range for each column; those of an argument may be empty. The first
-        argument is the time, the last one the parameters; operations on single values have neither.
-    """
-
-    kernel: int | str
-    arguments: tuple[range, ...]
+    kernel: int | str  # key of the function in `Program.functions`, or one of the operations above
+    arguments: tuple[range, ...]  # a range a column: first time, last parameters; empty of single ones
     results: tuple[range, ...]
 
 
 @dataclass(eq=False)
 class Program:
-    """Operations on numbered values: first those of t, x, w and p, then constants and results as they come.
-
-    Attributes
-    ----------
-    t, x, w, p, more : Cells
-        The arguments; ``more`` is a further one, such as the events that fire.
-    functions : dict
-        CasADi functions of the operations, by key.
-    operations : list of Operation
-        In an order in which they can be done.
-    constants : dict
-        Numbers by the value that holds them.
-    columns : list of range
-        Consecutive values.
-    """
+    """Operations on numbered values: first those of t, x, w and p, then constants and results as they come."""
 
     widths: tuple[int, int, int]
-    further: int = 0
+    further: int = 0  # entries of ``more``, such as the events that fire
     functions: dict[int, Any] = field(default_factory=dict)
-    operations: list[Operation] = field(default_factory=list)
-    constants: dict[int, float] = field(default_factory=dict)
-    columns: list[range] = field(default_factory=list)
+    operations: list[Operation] = field(default_factory=list)  # in an order in which they can be done
+    constants: dict[int, float] = field(default_factory=dict)  # by the value that holds them
+    columns: list[range] = field(default_factory=list)  # consecutive values
 
     def __post_init__(self) -> None:
         self.count = 0
@@ -156,48 +133,25 @@ def as_ids(values: Iterable[int]) -> Ids:
 
 @dataclass(frozen=True, eq=False)
 class TickProgram:
-    """A tick as a program.
-
-    Attributes
-    ----------
-    program : Program
-        The operations.
-    x_next, z, log, guards : Ids
-        The values that become the results of a tick; ``log`` is without the residual.
-    mismatch : tuple of Ids, or None
-        Of algebraic loops: what came round, and what was taken; None where the log has no residual.
-    rates : Ids, or None
-        The rates of the integrated states at an instant at which no clock acts; None at others.
-    unread : ndarray of int32
-        Entries of the log that may be no finite numbers: outputs of FMUs that nothing reads.
-    """
+    """A tick as a program."""
 
     program: Program
     x_next: Ids
     z: Ids
-    log: Ids
+    log: Ids  # without the residual
     guards: Ids
-    mismatch: tuple[Ids, Ids] | None
-    rates: Ids | None = None
+    mismatch: tuple[Ids, Ids] | None  # what came round algebraic loops, and what was taken
+    rates: Ids | None = None  # of the integrated states, where no clock acts
+    # int32: entries of the log that may be no finite numbers
     unread: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
 
 
 @dataclass(frozen=True, eq=False)
 class PartProgram:
-    """A function between ticks as a program: rates, indicators, or states after events.
-
-    Attributes
-    ----------
-    program : Program
-        The operations.
-    operations : list of Operation
-        Those that the results need, in an order in which they can be done.
-    results : tuple of Ids
-        The values of each result.
-    """
+    """A function between ticks as a program: rates, indicators, or states after events."""
 
     program: Program
-    operations: list[Operation]
+    operations: list[Operation]  # those that the results need, in an order
     results: tuple[Ids, ...]
 
     @classmethod

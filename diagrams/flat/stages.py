@@ -80,30 +80,14 @@ Evaluators = Mapping[str, Evaluator]
 
 @dataclass(frozen=True, eq=False)
 class TracedStage:
-    """One CasADi function over the blocks between two that have an evaluator.
-
-    Attributes
-    ----------
-    name : str
-        Name of its function.
-    arguments : tuple of MX
-        Symbols of the schedule's arguments; behind them that of c, where there is something to pass on.
-    results : tuple of MX
-        Expressions of these: of the part of c that it makes; of the last stage the schedule's results.
-    function : casadi.Function
-        From the arguments to the results.
-    makes : slice
-        Which part of c it makes; empty for the last stage.
-    by_block : bool
-        Whether the operations of each block are done as they are.
-    """
+    """One CasADi function over the blocks between two that have an evaluator."""
 
     name: str
-    arguments: tuple[Any, ...]
-    results: tuple[Any, ...]
+    arguments: tuple[Any, ...]  # symbols; behind them that of c, where there is something to pass on
+    results: tuple[Any, ...]  # expressions: of the part of c that it makes; of the last stage the results
     function: Any
-    makes: slice
-    by_block: bool = False
+    makes: slice  # which part of c; empty for the last stage
+    by_block: bool = False  # the operations of each block are done as they are
 
     @cached_property
     def fast(self) -> Any:
@@ -119,31 +103,15 @@ class TracedStage:
 
 @dataclass(frozen=True, eq=False)
 class OpaqueStage:
-    """A block that an `Evaluator` evaluates.
-
-    Attributes
-    ----------
-    path : str
-        The block.
-    names : tuple of str
-        The equations that are wanted of it; see `Evaluator.evaluate`.
-    states, inputs : slice
-        Where its states and inputs are in c.
-    makes : slice
-        Which part of c it makes.
-    has_parameters : bool
-        Whether the block has numbers of its own among the diagram's parameters.
-    by_time : bool
-        Whether it may depend on time by itself.
-    """
+    """A block that an `Evaluator` evaluates."""
 
     path: str
-    names: tuple[str, ...]
-    states: slice
+    names: tuple[str, ...]  # the equations that are wanted of it; see `Evaluator.evaluate`
+    states: slice  # where its states, and its inputs, are in c
     inputs: slice
-    makes: slice
-    has_parameters: bool
-    by_time: bool = True
+    makes: slice  # which part of c it makes
+    has_parameters: bool  # it has numbers among the diagram's parameters
+    by_time: bool = True  # it may depend on time by itself
 
     def evaluator(self, evaluators: Evaluators) -> Evaluator:
         """Return what evaluates it."""
@@ -167,25 +135,13 @@ class OpaqueStage:
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """A function of the whole diagram, in stages; the last one is traced and makes the results.
-
-    Attributes
-    ----------
-    name : str
-        Its name.
-    arguments, results : tuple of str
-        Names of its arguments, the time ``t`` first, and of its results. All of them are columns.
-    stages : tuple of TracedStage and OpaqueStage
-        In the order in which they are evaluated.
-    width : int
-        Number of entries of c, which is passed from stage to stage.
-    """
+    """A function of the whole diagram, in stages; the last one is traced and makes the results."""
 
     name: str
-    arguments: tuple[str, ...]
+    arguments: tuple[str, ...]  # columns, the time ``t`` first
     results: tuple[str, ...]
     stages: tuple[TracedStage | OpaqueStage, ...]
-    width: int
+    width: int  # entries of c, which is passed from stage to stage
 
     @property
     def opaque(self) -> tuple[OpaqueStage, ...]:
@@ -207,15 +163,7 @@ class Schedule:
         return self.last.function
 
     def __call__(self, *arguments: Any, evaluators: Evaluators | None = None) -> list[np.ndarray]:
-        """Evaluate it with numbers; return the results, flat.
-
-        Parameters
-        ----------
-        *arguments : array_like
-            One column for each argument.
-        evaluators : mapping, optional
-            Evaluators of the blocks of opaque stages, by path.
-        """
+        """Evaluate it with numbers, one column for each argument; return the results, flat."""
         c, t = np.zeros(self.width), np.ravel(arguments[0])
         made: list[np.ndarray] = []
         for stage in self.stages:
@@ -234,17 +182,7 @@ class Schedule:
         results: Sequence[np.ndarray] | None = None,
         evaluators: Evaluators | None = None,
     ) -> Bound:
-        """Return it bound to vectors, to be evaluated many times.
-
-        Parameters
-        ----------
-        arguments : sequence of ndarray
-            The vectors from which it is evaluated; their values at the time of the call count.
-        results : sequence of ndarray, optional
-            The vectors into which it is evaluated; new ones without them.
-        evaluators : mapping, optional
-            Evaluators of the blocks of opaque stages, by path.
-        """
+        """Return it bound to vectors, whose values at each call count; without results it makes new vectors."""
         if len(self.stages) == 1:
             return bind_function(self.last.evaluated, arguments, results)
         c, calls, kept = np.zeros(self.width), list[Callable[[], None]](), list[Bound]()
@@ -287,15 +225,7 @@ def evaluate_apart(evaluators: Evaluators | None) -> Apart:
 
 
 class Bound:
-    """A function bound to vectors: evaluated by ``call``, without a copy.
-
-    Attributes
-    ----------
-    call : callable
-        Evaluates it: from the vectors that it is bound to, into ``outputs``.
-    outputs : list of ndarray
-        One for each result; matrices column by column.
-    """
+    """A function bound to vectors: ``call`` evaluates it into ``outputs``, matrices column by column."""
 
     def __init__(self, call: Callable[[], None], outputs: list[np.ndarray], kept: Any = None):
         self.call, self.outputs = call, outputs

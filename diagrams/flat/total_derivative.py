@@ -26,19 +26,11 @@ ALONG = 2.0**-11
 class Derivative:
     """The results of a schedule and their total derivatives by some of its arguments.
 
-    It is evaluated into the results, where they are wanted, then for each result its derivative by each argument.
-    Without opaque stages this is one CasADi function. With some, ``D``, the derivative of everything that is carried
-    from stage to stage, is built up on the way: where a stage makes part of c from the argument v and from c, that
-    part of D is ∂/∂v + ∂/∂c D. Of an opaque stage the evaluator gives the derivative.
-
-    Parameters
-    ----------
-    schedule : Schedule
-        The function that is differentiated.
-    by : sequence of (str, sequence of int or None)
-        By which arguments, and which entries of them.
-    values : bool, default: True
-        Whether the results themselves are wanted, too.
+    It is evaluated into the results, where they are wanted (``values``), then for each result its derivative by each
+    argument, or by some entries of it. Without opaque stages this is one CasADi function. With some, ``D``, the
+    derivative of everything that is passed from stage to stage, is built up on the way: where a stage makes part of c
+    from the argument v and from c, that part of D is ∂/∂v + ∂/∂c D. Of an opaque stage the evaluator gives the
+    derivative.
     """
 
     def __init__(self, schedule: Schedule, by: Sequence[By], *, values: bool = True):
@@ -64,7 +56,7 @@ class Derivative:
         whole = [] if not staged else [(stage.arguments[-1], None)]
         variables = [*((symbols[name], entries) for name, entries in self.by), *whole]
         slopes = _slopes(stage.results, variables)
-        names = [*self.schedule.arguments, *(["carried"] if staged else [])]
+        names = [*self.schedule.arguments, *(["passed"] if staged else [])]
         shown = [ca.densify(e) for e in stage.results if staged or self.values]
         outputs = [f"o{i}" for i in range(len(shown) + len(slopes))]
         return ca.Function(f"{stage.name}_derivative", [*stage.arguments], [*shown, *slopes], names, outputs)
@@ -114,15 +106,7 @@ class Derivative:
         return speed_up(self._functions[id(self.schedule.last)])
 
     def __call__(self, *arguments: Any, evaluators: Evaluators | None = None) -> list[np.ndarray]:
-        """Evaluate it with numbers; return the results, flat, if they are wanted, and the derivatives as matrices.
-
-        Parameters
-        ----------
-        *arguments : array_like
-            One column for each argument of the schedule.
-        evaluators : mapping, optional
-            Evaluators of the blocks of opaque stages, by path.
-        """
+        """Evaluate it with numbers; return the results, flat, if they are wanted, and the derivatives as matrices."""
         schedule = self.schedule
         count = len(schedule.results)
         if not schedule.opaque:
@@ -169,13 +153,6 @@ class Derivative:
         """Return what a call returns, its derivative along a direction, and an estimate of that one's largest error.
 
         It is exact without opaque stages; with some it is made of central differences of fourth order.
-
-        Parameters
-        ----------
-        arguments, direction : sequence of ndarray
-            One column for each argument of the schedule, and the direction in which they move.
-        evaluators : mapping, optional
-            As of a call.
         """
         schedule = self.schedule
         if not schedule.opaque:

@@ -23,19 +23,11 @@ def trace_schedule(
     *,
     by_block: bool = False,
 ) -> Schedule:
-    """Trace a function of the whole diagram.
+    """Trace a function of the whole diagram by symbols, the time ``t`` first.
 
-    Parameters
-    ----------
-    name : str
-        Its name.
-    arguments : mapping
-        The symbols that it is a function of, by name; the time ``t`` comes first.
-    results : callable
-        Evaluates the diagram with these symbols and returns the results by name, as expressions. It is called with
-        what `evaluate` takes as ``apart``: this cuts the evaluation at the blocks that have an evaluator.
-    by_block : bool
-        Do the operations of each block as they are; else those of all blocks are simplified together.
+    ``results`` evaluates the diagram with these symbols. It is called with what `evaluate` takes as ``apart``: this
+    cuts the evaluation at the blocks that have an evaluator. ``by_block`` does the operations of each block as they
+    are; else those of all blocks are simplified together.
     """
     cuts = _Cuts()
     made = {n: ca.densify(ca.MX(e)) for n, e in results(cuts).items()}  # a buffer holds every entry, zeros too
@@ -56,7 +48,7 @@ class _StageCut:
 
     Attributes
     ----------
-    carried : list of (symbol, expression)
+    passed : list of (symbol, expression)
         Columns that were made since the cut before; behind the cut the symbols stand for them.
     outputs : list of MX
         Symbols of what the block makes.
@@ -67,7 +59,7 @@ class _StageCut:
     states: Any
     inputs: Any
     has_parameters: bool
-    carried: list[tuple[Any, Any]]
+    passed: list[tuple[Any, Any]]
     outputs: list[Any]
     by_time: bool
     may_drop: bool
@@ -85,15 +77,15 @@ class _Cuts:
     def __call__(
         self, instant: Instant, path: str, names: tuple[str, ...], states: Any, inputs: Sequence[Any]
     ) -> list[Any]:
-        carried: dict[int, tuple[Any, Any]] = {}
+        passed: dict[int, tuple[Any, Any]] = {}
 
         def carry(column: Any) -> Any:
             if not isinstance(column, ca.MX) or column.is_constant() or column.is_symbolic():
                 return column
             key = column.__hash__()
-            if key not in carried:
-                carried[key] = ca.MX.sym("carried", column.numel()), column
-            return carried[key][0]
+            if key not in passed:
+                passed[key] = ca.MX.sym("passed", column.numel()), column
+            return passed[key][0]
 
         own = instant.layout.parameters.slices[path]  # its sample time, and its parameters
         outputs = [ca.MX.sym(f"{path}.{name}", instant.size_of(path, name)) for name in names]
@@ -106,7 +98,7 @@ class _Cuts:
                 states,
                 join_columns(columns),
                 own.stop > own.start + 1,
-                [*carried.values()],
+                [*passed.values()],
                 outputs,
                 _varies(instant, path, names),
                 names != (JUMP,) and path in instant.layout.in_model_exchange,
@@ -124,7 +116,7 @@ def _varies(instant: Instant, path: str, names: tuple[str, ...]) -> bool:
 def _in_stages(
     name: str, names: tuple[str, ...], symbols: tuple[Any, ...], results: Mapping[str, Any], cuts: Sequence[_StageCut]
 ) -> Schedule:
-    """Return the schedule of an evaluation that was cut: all that is carried gets its place in one vector c."""
+    """Return the schedule of an evaluation that was cut: all that is passed gets its place in one vector c."""
     places: list[tuple[Any, slice]] = []
     width = 0
 
@@ -136,12 +128,12 @@ def _in_stages(
     parts: list[tuple[list[Any], slice, OpaqueStage]] = []
     for cut in cuts:
         first = width
-        places += [(symbol, place(symbol.numel())) for symbol, _ in cut.carried]
+        places += [(symbol, place(symbol.numel())) for symbol, _ in cut.passed]
         states, inputs = place(cut.states.numel()), place(cut.inputs.numel())
         end = width
         places += [(symbol, place(symbol.numel())) for symbol in cut.outputs]
         opaque = OpaqueStage(cut.path, cut.names, states, inputs, slice(end, width), cut.has_parameters, cut.by_time)
-        parts.append(([*(e for _, e in cut.carried), cut.states, cut.inputs], slice(first, end), opaque))
+        parts.append(([*(e for _, e in cut.passed), cut.states, cut.inputs], slice(first, end), opaque))
     c = ca.MX.sym("c", width)
     known = [symbol for symbol, where in places if where.stop > where.start]
     values = [c[where] for _, where in places if where.stop > where.start]
@@ -150,7 +142,7 @@ def _in_stages(
         return tuple(ca.densify(e) for e in ca.substitute([*expressions], known, values))
 
     stages: list[TracedStage | OpaqueStage] = []
-    arguments, names_in = (*symbols, c), [*names, "carried"]
+    arguments, names_in = (*symbols, c), [*names, "passed"]
     for i, (expressions, makes, opaque) in enumerate(parts):
         if makes.stop > makes.start:
             made = of_c([ca.vertcat(*expressions)])
@@ -164,22 +156,22 @@ def _in_stages(
 
 
 def _join_again(results: Mapping[str, Any], cuts: Sequence[_StageCut]) -> dict[str, Any]:
-    """Return the results with whatever was carried over cuts that nothing needs; so do later cuts."""
+    """Return the results with whatever was passed over cuts that nothing needs; so do later cuts."""
     expressions = [*results.values()]
     for i, cut in reversed([*enumerate(cuts)]):
-        if cut.needed or not cut.carried:
+        if cut.needed or not cut.passed:
             continue
-        symbols, carried = zip(*cut.carried, strict=True)
+        symbols, passed = zip(*cut.passed, strict=True)
         later = [of for of in cuts[i + 1 :] if of.needed]
         joined = [
             *expressions,
-            *chain.from_iterable((of.states, of.inputs, *(e for _, e in of.carried)) for of in later),
+            *chain.from_iterable((of.states, of.inputs, *(e for _, e in of.passed)) for of in later),
         ]
-        found = iter(ca.substitute(joined, [*symbols], [*carried]))
+        found = iter(ca.substitute(joined, [*symbols], [*passed]))
         expressions = [next(found) for _ in expressions]
         for of in later:
             of.states, of.inputs = next(found), next(found)
-            of.carried = [(symbol, next(found)) for symbol, _ in of.carried]
+            of.passed = [(symbol, next(found)) for symbol, _ in of.passed]
     return dict(zip(results, expressions, strict=True))
 
 
@@ -187,10 +179,10 @@ def _drop_unused(results: Iterable[Any], cuts: Sequence[_StageCut]) -> None:
     """Leave out what no later stage needs of what was made before a cut, and evaluations that nothing needs."""
     needed = _symbols_of(results)
     for cut in reversed(cuts):
-        cut.carried = [(symbol, e) for symbol, e in cut.carried if symbol.__hash__() in needed]
+        cut.passed = [(symbol, e) for symbol, e in cut.passed if symbol.__hash__() in needed]
         cut.needed = any(symbol.__hash__() in needed for symbol in cut.outputs) or not cut.may_drop
         own = [cut.states, cut.inputs] if cut.needed else []
-        needed |= _symbols_of([*(e for _, e in cut.carried), *own])
+        needed |= _symbols_of([*(e for _, e in cut.passed), *own])
 
 
 def _symbols_of(expressions: Iterable[Any]) -> set[int]:

@@ -15,25 +15,13 @@ from .program import Cells
 
 
 class Vectors:
-    """An instant, in memory that functions are bound to.
-
-    Attributes
-    ----------
-    t : ndarray
-        Time in s, shape (1,).
-    x : ndarray
-        States, held outputs, gates, reset states and loop values, shape (`FlatLayout.width`,).
-    w : ndarray
-        Outputs of plants and of transport delays.
-    p : ndarray
-        Parameters; one vector may serve several instants of a run.
-    """
+    """An instant, in memory that functions are bound to."""
 
     def __init__(self, layout: FlatLayout, p: np.ndarray):
-        self.t = np.zeros(1)
-        self.x = layout.x0.copy()
-        self.w = np.zeros(layout.plant_outputs.total)
-        self.p = p
+        self.t = np.zeros(1)  # time in s, shape (1,)
+        self.x = layout.x0.copy()  # states, held outputs, gates, reset states and loop values
+        self.w = np.zeros(layout.plant_outputs.total)  # outputs of plants and of transport delays
+        self.p = p  # parameters; one vector may serve several instants of a run
 
 
 def next_x(instant: Instant) -> Any:

@@ -227,13 +227,7 @@ class WiredDiagram:
         return found
 
     def renumbered(self, blocks: Mapping[str, Block]) -> WiredDiagram:
-        """Return a variant with other numbers, which shares the functions of this diagram; nothing is checked again.
-
-        Parameters
-        ----------
-        blocks : mapping of str to Block
-            Blocks by path that differ from those of this diagram in numbers alone: their traces are the same ones.
-        """
+        """Return a variant with blocks of other numbers alone, which shares the functions; nothing is checked again."""
         found = WiredDiagram.__new__(WiredDiagram)
         found.__dict__.update(self.__dict__)
         found._forget()
@@ -254,15 +248,7 @@ class WiredDiagram:
         return self.flattened(other.base, asked=other.asked)
 
     def flattened(self, step: Fraction | None, *, asked: bool | None = None) -> FlatDiagram:
-        """Return the diagram for a step that is exact already; None takes that of the clocks.
-
-        Parameters
-        ----------
-        step : Fraction, optional
-            Seconds between two ticks.
-        asked : bool, optional
-            Whether it was asked for, and is not that of the clocks; by default it was if it is given.
-        """
+        """Return the diagram for an exact step in s; None takes that of the clocks. ``asked``: a user has given it."""
         asked = step is not None if asked is None else asked
         key = (step, asked)
         if key not in self._flat and self._origin is not None:

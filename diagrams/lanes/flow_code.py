@@ -43,31 +43,15 @@ static inline void step_states(double from, double end, vec *x, const vec *w, co
 
 @dataclass(frozen=True, eq=False)
 class FlowSource:
-    """The rates of a diagram's continuous states, and the method that integrates them.
+    """The rates of a diagram's continuous states, and the method that integrates them."""
 
-    Attributes
-    ----------
-    rates : casadi.Function
-        ``(t, x, w, p) -> dx``.
-    where : sequence of int
-        Entries of x that they belong to.
-    method : str
-        A method of fixed step.
-    """
-
-    rates: Any
-    where: Sequence[int]
-    method: str
+    rates: Any  # (t, x, w, p) -> dx
+    where: Sequence[int]  # entries of x that they belong to
+    method: str  # of fixed step
 
 
 def write_flow(source: FlowSource, scalars: ScalarFunctions) -> tuple[str, int]:
-    """Write the C code of a step; return it with the number of vectors that are kept.
-
-    Raises
-    ------
-    NoLanesError
-        For an operation that has no form over vectors.
-    """
+    """Write the C code of a step; return it with the number of vectors that are kept."""
     code = scalars.write_calls("flow", source.rates, ("t", "x", "w", "p"), {3})
     n, stages = len(source.where), METHODS[source.method].stages
     sizes = {"where": ", ".join(map(str, source.where)), "n": str(n)}

@@ -62,22 +62,7 @@ static void {name}(const vec *t, const vec *x, const vec *w, const vec *p, vec *
 
 
 class GroupedCode:
-    """The C code of ticks as runs of equal blocks, which share the functions of their blocks.
-
-    Parameters
-    ----------
-    programs : sequence of TickProgram
-        The ticks.
-    scalars : ScalarFunctions
-        Functions that are called lane by lane.
-    driver : str
-        The C code that goes over the groups.
-
-    Attributes
-    ----------
-    text : str
-        The C code that comes before the ticks.
-    """
+    """The C code of ticks as runs of equal blocks, which share their functions; ``text`` comes before the ticks."""
 
     def __init__(self, programs: Sequence[TickProgram], scalars: ScalarFunctions, driver: str):
         self._of: dict[int | str, Kernel] = {}

@@ -49,29 +49,7 @@ def write_lanes(
     flow: FlowSource | None = None,
     loops: Mapping[int, LoopSource] | None = None,
 ) -> tuple[str, Room]:
-    """Write the C code that goes over ticks with a vector of runs; return it with the memory that it needs.
-
-    Parameters
-    ----------
-    ticks : TickSources
-        The ticks.
-    kinds : sequence of frozenset of TickPattern
-        The sets of clocks that act together.
-    plants : sequence of LanePlant
-        The FMUs in their order.
-    sizes : LaneSizes
-        Entries of the vectors.
-    count : int
-        Runs in a vector.
-    scalars : ScalarFunctions
-        Functions that are called lane by lane; those of the ticks are in it.
-    start : StartSource, optional
-        Functions from which runs start.
-    flow : FlowSource, optional
-        Rates of the continuous states.
-    loops : mapping of int to LoopSource, optional
-        The algebraic loops of some kinds of ticks.
-    """
+    """Write the C code that goes over ticks with a vector of runs; return it with the memory that it needs."""
     head = [f"#define LANES {count}\n", f"#define TRUTH {TRUE!r}\n"]
     head += [f"#define N_{name.upper()} {size}\n" for name, size in vars(sizes).items()]
     parts = [ticks.text]
@@ -138,13 +116,7 @@ def write_lanes(
 
 @dataclass(frozen=True)
 class Room:
-    """Vectors of memory that the code needs.
-
-    Attributes
-    ----------
-    run, start : int
-        To go over ticks, and for the first one.
-    """
+    """Vectors of memory that the code needs: to go over ticks, and for the first one."""
 
     run: int
     start: int
@@ -152,58 +124,26 @@ class Room:
 
 @dataclass(frozen=True, eq=False)
 class LaneCode:
-    """The C code of a vector of runs, loaded.
+    """The C code of a vector of runs, loaded."""
 
-    Attributes
-    ----------
-    run : callable
-        Goes over ticks.
-    kinds : mapping
-        The sets of clocks that act together, with their numbers.
-    plants : mapping of str to LanePlant
-        The FMUs by path.
-    sizes : LaneSizes
-        Entries of the vectors.
-    count : int
-        Runs in a vector.
-    library : CDLL
-        The library, which is loaded as long as this lives.
-    starts : LaneStarts or None
-        Functions of the start of runs; None if it can't be computed over vectors.
-    room : Room
-        Vectors of memory that it needs.
-    """
-
-    run: Any
-    kinds: Mapping[frozenset[TickPattern], int]
+    run: Any  # goes over ticks
+    kinds: Mapping[frozenset[TickPattern], int]  # sets of clocks that act together, with their numbers
     plants: Mapping[str, LanePlant]
     sizes: LaneSizes
-    count: int
-    library: ctypes.CDLL
-    starts: LaneStarts | None = None
+    count: int  # runs in a vector
+    library: ctypes.CDLL  # loaded as long as this lives
+    starts: LaneStarts | None = None  # None if the start can't be computed over vectors
     room: Room = Room(0, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class LaneStarts:
-    """C functions of the start of a vector of runs; each takes addresses of vectors.
+    """C functions of the start of a vector of runs; each takes addresses of vectors."""
 
-    Attributes
-    ----------
-    tick : callable
-        ``(x, w, p, x_next, z, log, ok, kept)``: the tick with which they begin, and its memory.
-    outputs : callable
-        ``(plants, z, w)``: outputs of the FMUs at their inputs in z, which they keep; z may be None.
-    values : list of callable
-        ``(x, w, p, left, values)``, as `StartSource` has them.
-    sizes : list of int
-        Number of values of each.
-    """
-
-    tick: Any
-    outputs: Any
-    values: list[Any]
-    sizes: list[int]
+    tick: Any  # (x, w, p, x_next, z, log, ok, kept): the first tick, and its memory
+    outputs: Any  # (plants, z, w): the FMUs keep their inputs in z, which may be None
+    values: list[Any]  # (x, w, p, left, values), as `StartSource` has them
+    sizes: list[int]  # number of values of each
 
 
 _COMPILING = Lock()
@@ -217,27 +157,9 @@ def compile_lanes(
     method: str = "",
     loops: Mapping[frozenset[TickPattern], NewtonOptions] | None = None,
 ) -> LaneCode:
-    """Compile the code that goes over ticks with a vector of runs, unless the cache has it.
+    """Compile the code that goes over ticks with a vector of ``count`` runs, unless the cache has it.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    acting : sequence of frozenset of TickPattern
-        The sets of clocks that act together at some tick.
-    count : int
-        Runs in a vector.
-    start : StartSource, optional
-        Functions from which runs start.
-    method : str
-        The method of fixed step that integrates continuous states; empty where there is none.
-    loops : mapping, optional
-        How the algebraic loops of each tick are solved, where there are some.
-
-    Raises
-    ------
-    NoLanesError
-        If its runs can't go side by side, or there is no compiler.
+    ``method`` is one of fixed step that integrates continuous states; empty where there are none.
     """
     with _COMPILING:
         known: dict[Any, LaneCode] = flat.made["lanes"]
@@ -293,13 +215,7 @@ def _compile(
 
 
 def _check_size(function: Any) -> Any:
-    """Return a function of the whole diagram, in which each operation on scalars is done once.
-
-    Raises
-    ------
-    NoLanesError
-        If it is too large to be compiled as a whole.
-    """
+    """Return a function of the whole diagram, in which each operation on scalars is done once; refuse a large one."""
     if not function.is_a("SXFunction"):
         return function
     if (operations := function.n_instructions()) > LARGEST:

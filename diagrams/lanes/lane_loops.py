@@ -62,28 +62,14 @@ static mask ${name}(const vec *t, vec *x, const vec *w, const vec *p, const vec 
 
 @dataclass(frozen=True, eq=False)
 class LoopSource:
-    """The algebraic loops at a tick.
+    """The algebraic loops at a tick."""
 
-    Attributes
-    ----------
-    equations : casadi.Function
-        ``(t, x, w, p) -> (r, J)``: the mismatch at the values in x, and its derivative by them.
-    options : NewtonOptions
-        How they are solved.
-    """
-
-    equations: Any
+    equations: Any  # (t, x, w, p) -> (r, J): the mismatch at the values in x, and its derivative
     options: NewtonOptions
 
 
 def write_loops(name: str, source: LoopSource, arguments: Sequence[str], scalars: ScalarFunctions) -> tuple[str, int]:
-    """Write the C code of ``NAME(t, x, w, p, kept, alive)``; return it with the number of vectors that are kept.
-
-    Raises
-    ------
-    NoLanesError
-        For an operation that has no form over vectors.
-    """
+    """Write the C code of ``NAME(t, x, w, p, kept, alive)``; return it with the number of vectors that are kept."""
     f, options = source.equations, source.options
     symbols = f.sx_in() if f.is_a("SXFunction") else f.mx_in()
     r, slopes = f.call(symbols)

@@ -83,31 +83,15 @@ static void ${name}_end(const $name *self, vec *into) {
 
 @dataclass(frozen=True, eq=False)
 class LanePlant:
-    """An FMU's equations, and where its ports are.
-
-    Attributes
-    ----------
-    path : str
-        The FMU's path.
-    derivative, output : casadi.Function
-        ``(t, x, u, p) -> dx`` and ``(t, x, u, p) -> y``.
-    inputs : sequence of (int, int)
-        Entries of u, and those of z that they take.
-    outputs : sequence of (int, str, int)
-        Entries of w, and what they are: an entry of "x", "u" or "y".
-    references : sequence of int
-        Value references of the parameters, inputs and states, in this order, then of the integrator's step and kind.
-    entries : mapping of int to slice
-        Where the values of these are among the numbers of a run, by value reference; without the integrator's.
-    """
+    """An FMU's equations, and where its ports are."""
 
     path: str
-    derivative: Any
-    output: Any
-    inputs: Sequence[tuple[int, int]]
-    outputs: Sequence[tuple[int, str, int]]
-    references: Sequence[int]
-    entries: Mapping[int, slice]
+    derivative: Any  # (t, x, u, p) -> dx
+    output: Any  # (t, x, u, p) -> y
+    inputs: Sequence[tuple[int, int]]  # entries of u, and those of z that they take
+    outputs: Sequence[tuple[int, str, int]]  # entries of w, and what they are: an entry of x, u or y
+    references: Sequence[int]  # of parameters, inputs, states, then of the integrator's step and kind
+    entries: Mapping[int, slice]  # where their values are among a run's numbers, without the integrator's
 
     @cached_property
     def width(self) -> int:
@@ -134,13 +118,7 @@ class LanePlant:
         )
 
     def read(self, plant: FmuInstance) -> tuple[np.ndarray, float]:
-        """Return the numbers of an FMU at the start of a run, and the longest step of its integrator in s.
-
-        Raises
-        ------
-        NoLanesError
-            If it integrates with a step that is not fixed.
-        """
+        """Return the numbers of an FMU at the start of a run, and the longest step of its integrator in s."""
         size = self.width + 2
         given = plant.call("reading its numbers", plant.fmi.get, "Float64", self.references, size)
         *found, step, integrator = np.array(given, dtype=float)
@@ -153,13 +131,7 @@ class LanePlant:
 
 
 def read_plant(path: str, block: Fmu, inputs: Mapping[str, slice], outputs: Mapping[str, slice]) -> LanePlant:
-    """Return the equations of an FMU, with its ports at some places of z and w.
-
-    Raises
-    ------
-    NoLanesError
-        If they can't be had.
-    """
+    """Return the equations of an FMU, with its ports at some places of z and w."""
     try:
         found = read_equations(block.description.file)
     except FmuError as error:

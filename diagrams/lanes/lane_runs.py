@@ -14,77 +14,30 @@ from .lane_code import LaneCode
 
 @dataclass(frozen=True, eq=False)
 class LaneStart:
-    """The numbers of a run at its first tick.
-
-    Attributes
-    ----------
-    x, w, z, p : ndarray
-        States, outputs and inputs of the FMUs, and parameters of the diagram.
-    plants : mapping of str to ndarray
-        Parameters, inputs and states of each FMU.
-    steps : tuple of float
-        Longest step of each FMU's integrator in s. Runs go side by side if these are equal.
-    row : ndarray
-        The entries of the log that are kept.
-    messages : tuple of str
-        What its start has reported.
-    """
+    """The numbers of a run at its first tick."""
 
     x: np.ndarray
     w: np.ndarray
     z: np.ndarray
     p: np.ndarray
-    plants: Mapping[str, np.ndarray]
-    steps: tuple[float, ...]
-    row: np.ndarray
-    messages: tuple[str, ...] = ()
+    plants: Mapping[str, np.ndarray]  # parameters, inputs and states of each FMU
+    steps: tuple[float, ...]  # longest of each FMU's integrator in s; equal for runs side by side
+    row: np.ndarray  # the entries of the log that are kept
+    messages: tuple[str, ...] = ()  # what its start has reported
 
 
 @dataclass(frozen=True, eq=False)
 class LaneEnd:
-    """The end of a run that went side by side with others.
+    """The end of a run that went side by side with others; ticks are counted from the first one that was gone to."""
 
-    Attributes
-    ----------
-    failed : int
-        The tick that it could not go beyond, counted from the first one that was gone to; 0 if none.
-    stopped : int
-        The tick at which a stop condition ended it; 0 if none.
-    by : int
-        That condition, by its place.
-    last : ndarray
-        The entries of the log that are kept, at its end.
-    """
-
-    failed: int
-    stopped: int
-    by: int
-    last: np.ndarray
+    failed: int  # the tick that it could not go beyond; 0 if none
+    stopped: int  # the tick at which a stop condition ended it; 0 if none
+    by: int  # that condition, by its place
+    last: np.ndarray  # the entries of the log that are kept, at its end
 
 
 class LaneVectors:
-    """The numbers of a vector of runs at their first tick; each array has a column for each lane.
-
-    Parameters
-    ----------
-    code : LaneCode
-        The code.
-    columns : int
-        Entries of the log that are kept.
-
-    Attributes
-    ----------
-    p, x, w, z : ndarray
-        As `LaneStart` has them.
-    plants : ndarray
-        Parameters, inputs and states of the FMUs, one after the other.
-    row : ndarray
-        The entries of the log that are kept.
-    steps : tuple of float
-        Longest step of each FMU's integrator in s.
-    messages : list of tuple of str
-        What the start of each run has reported.
-    """
+    """The numbers of runs at their first tick, as `LaneStart` has them; arrays have a column for each run."""
 
     def __init__(self, code: LaneCode, columns: int):
         sizes, count = code.sizes, code.count
@@ -113,27 +66,13 @@ class LaneVectors:
         return len(self.messages)
 
     def fill(self) -> None:
-        """Let lanes without a run of their own repeat the first one."""
+        """Let lanes without a run repeat the first one."""
         for values in (self.p, self.x, self.w, self.z, self.plants, self.row):
             values[:, self.count :] = values[:, :1]
 
 
 class LaneRuns:
-    """A vector of runs of one diagram, at most as many as the code has lanes.
-
-    Parameters
-    ----------
-    code : LaneCode
-        The code.
-    vectors : LaneVectors
-        The runs' numbers, which change as they continue.
-    columns : ndarray
-        Entries of the log that are kept.
-    every : int
-        One of so many rows is kept.
-    stops : sequence of int
-        Entries of the log that end a run where they are true.
-    """
+    """A vector of runs of one diagram, at most as many as the code has lanes; ``vectors`` change as they continue."""
 
     def __init__(self, code: LaneCode, vectors: LaneVectors, *, columns: np.ndarray, every: int, stops: Sequence[int]):
         self._code, self._columns = code, np.ascontiguousarray(columns, dtype=np.int64)
@@ -173,19 +112,7 @@ class LaneRuns:
         return int(self._structure.skip)
 
     def run(self, times: np.ndarray, widths: np.ndarray, kinds: np.ndarray, rows: np.ndarray) -> int:
-        """Go through ticks, as `CompiledLoop.run` does; return the number of rows that were written.
-
-        Parameters
-        ----------
-        times : ndarray, shape (n + 1,)
-            Time of the tick before them, and of each of them, in s.
-        widths : ndarray, shape (n,)
-            Length of each tick, in s.
-        kinds : ndarray, shape (n,), of int32
-            Clocks that act at each of them, as numbers of the code.
-        rows : ndarray, shape (m, columns, lanes)
-            The memory for the rows, of `make_room`.
-        """
+        """Go through ticks as `CompiledLoop.run` does, into rows of `make_room`; return the number of written ones."""
         self._structure.rows = 0
         self._code.run(
             ctypes.byref(self._structure),

@@ -20,21 +20,7 @@ _TICK = ("t", "x", "w", "p")
 class TickSources:
     """The ticks of a diagram, to be written as C over vectors: ``NAME(t, x, w, p, kept, x_next, z, log, ok)``.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    acting : sequence of frozenset of TickPattern
-        The sets of clocks that act together at some tick.
-    scalars : ScalarFunctions
-        Functions that are called lane by lane.
-
-    Attributes
-    ----------
-    text : str
-        The C code that comes before the ticks.
-    is_grouped : bool
-        Whether they are groups of equal blocks, whose values need memory.
+    ``text`` comes before them; ``is_grouped``: they are groups of equal blocks, whose values need memory.
     """
 
     def __init__(self, flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], scalars: ScalarFunctions):
@@ -48,13 +34,7 @@ class TickSources:
             self.text = self._code.text
 
     def write(self, name: str, clocks: frozenset[TickPattern]) -> VectorCode:
-        """Write the tick at which some clocks act, under a name.
-
-        Raises
-        ------
-        NoLanesError
-            For an operation that has no form over vectors.
-        """
+        """Write the tick at which some clocks act, under a name."""
         if self.is_grouped:
             return self._code.write(name, self._programs[clocks])
         return write_vectors(name, self._straight[clocks], _TICK, {3})

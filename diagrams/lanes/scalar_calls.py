@@ -37,17 +37,7 @@ class ScalarFunctions:
     ) -> VectorCode:
         """Write a function over vectors: in vector operations where it has them, else as a call for each lane.
 
-        Each lane has the bits that the function has when it is compiled for one run.
-
-        Parameters
-        ----------
-        name, function, arguments, fixed, inlined
-            See `write_vectors`; the function may be an ``MXFunction``, too.
-
-        Raises
-        ------
-        NoLanesError
-            For a function that needs too much memory.
+        Each lane has the bits that the function has when it is compiled for one run. See `write_vectors`.
         """
         if function.is_a("SXFunction"):
             return write_vectors(name, function, arguments, fixed, inlined=inlined)

@@ -39,40 +39,17 @@ VISIBLE void loopwright_start{i}(const vec *x, const vec *w, const vec *p, const
 
 @dataclass(frozen=True, eq=False)
 class StartSource:
-    """Functions from which runs start.
+    """Functions from which runs start."""
 
-    Attributes
-    ----------
-    clocks : frozenset of TickPattern
-        The clocks that act at the tick with which they begin.
-    values : sequence of casadi.Function
-        Each ``(x, w, p, left) -> columns``.
-    key : object
-        Equal keys, equal functions of one diagram.
-    """
-
-    clocks: frozenset[TickPattern]
-    values: Sequence[Any]
-    key: Any
+    clocks: frozenset[TickPattern]  # that act at the tick with which they begin
+    values: Sequence[Any]  # each (x, w, p, left) -> columns
+    key: Any  # equal keys, equal functions of one diagram
 
 
 def write_start(
     source: StartSource, plants: Sequence[LanePlant], ticks: TickSources, scalars: ScalarFunctions
 ) -> tuple[str, int]:
-    """Write the C code; it comes after that of the FMUs, ``plant0`` and so on.
-
-    Returns
-    -------
-    text : str
-        The C code.
-    kept : int
-        Vectors of memory that the first tick needs.
-
-    Raises
-    ------
-    NoLanesError
-        For an operation that has no form over vectors.
-    """
+    """Write the C code, which comes after that of the FMUs; return it with the vectors that the first tick needs."""
     tick = ticks.write("first_tick", source.clocks)
     looks, at = list[str](), 0
     for i, plant in enumerate(plants):

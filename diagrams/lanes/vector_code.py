@@ -20,18 +20,10 @@ _LOGIC = (ca.OP_NOT, ca.OP_AND, ca.OP_OR)
 
 @dataclass(frozen=True)
 class VectorCode:
-    """The C code of a function.
+    """The C code of a function."""
 
-    Attributes
-    ----------
-    text : str
-        ``NAME_prepare(arguments that are fixed, kept)`` and ``NAME(arguments, kept, results)``.
-    kept : int
-        Number of vectors that are computed from fixed arguments, once.
-    """
-
-    text: str
-    kept: int
+    text: str  # NAME_prepare(fixed arguments, kept) and NAME(arguments, kept, results)
+    kept: int  # vectors that are computed from fixed arguments, once
 
 
 @dataclass
@@ -53,26 +45,9 @@ def write_vectors(
     """Write a function of scalar operations as C code over vectors.
 
     Its operations are those of the function, one for one, but for two: a product that is used in one sum alone is
-    written within it, so that the processor may do both at once (FMA), and a division by what fixed arguments
-    determine is a product with its reciprocal.
-
-    Parameters
-    ----------
-    name : str
-        Name of the C function.
-    function : casadi.Function
-        The function, an ``SXFunction``.
-    arguments : sequence of str
-        Names of its arguments in C; each is an array of vectors.
-    fixed : collection of int
-        Arguments that don't change in a run: what they determine is computed once.
-    inlined : bool
-        Whether the compiler has to write it where it is called, for which it takes long if it is large.
-
-    Raises
-    ------
-    NoLanesError
-        For an operation that has no form over vectors.
+    written within it, so that the processor may do both at once (FMA), and a division by what ``fixed`` arguments
+    (those that don't change in a run) determine is a product with its reciprocal. The compiler takes long to inline a
+    large one.
     """
     writer = _Writer(function, arguments, fixed)
     writer.write()
