@@ -22,7 +22,7 @@ SHOWN = 24
 ZEROS_ORDER = 6
 """Order of Padé's approximation whose zeros say where a response bends."""
 MOST_TURNS = 5000
-"""Frequencies in even steps at which a response is drawn besides."""
+"""Frequencies in even steps that are added where a response is drawn."""
 SETTLED = 1e-3
 """Difference of L from its limit, relative to that and to 1 + L, that is left where it has settled."""
 MOST_CYCLES = 60
@@ -161,7 +161,7 @@ class DelayedRealization:
 
     @property
     def late(self) -> float:
-        """Delay in s by which L turns at most, besides the turns that its poles and zeros make."""
+        """Delay in s by which L turns at most, not counting the turns that its poles and zeros make."""
         return float(np.sum(self.tau))
 
     @property

@@ -43,10 +43,7 @@ class DelayedEquations:
     _solvers: dict[float, np.ndarray] = field(default_factory=dict)
 
     def respond(self, u: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return the outputs at rising times from 0 on, from rest, with constant inputs from t = 0 on.
-
-        Raises `ConfirmationError` if the response needs too many elements.
-        """
+        """Return the outputs at rising times from 0 on, from rest, with constant inputs from t = 0 on."""
         end = float(times[-1])
         edges = self._edges(end)
         longest = min([float(self.tau.min(initial=np.inf)), end, *([0.5 / self._fastest()] if len(self.A) else [])])

@@ -303,7 +303,7 @@ def _find_largest(r: Realization, skew: float, matrix: Callable[[float], np.ndar
 
 
 def _make_grid(r: Realization) -> np.ndarray:
-    """Return frequencies around all open-loop and closed-loop poles, 20 a decade besides, and both ends."""
+    """Return frequencies around all open-loop and closed-loop poles, further 20 a decade, and both ends."""
     features = Features.of(r)
     sizes = features.sizes()
     low, high = (sizes[0] / 1e3, sizes[-1] * 1e3) if len(sizes) else (1e-3, 1e3)

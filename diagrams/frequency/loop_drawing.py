@@ -22,21 +22,15 @@ OFF_THE_PAGE = 1e3
 
 @dataclass(frozen=True)
 class DrawnLoop:
-    """A loop to draw.
-
-    ``omega``, ``values``: frequencies in rad/s, ascending, and L there.
-    ``margins``: margins that are marked; None where they are not known.
-    ``dt``: sample time in s, 0 of a continuous loop.
-    ``is_measured``: whether the values are points of data.
-    """
+    """A loop to draw, L at rising frequencies, with the margins that are marked."""
 
     title: str
-    omega: np.ndarray
+    omega: np.ndarray  # in rad/s
     values: np.ndarray
     look: Mapping[str, Any]
-    margins: Margins | None = None
-    dt: float = 0.0
-    is_measured: bool = False
+    margins: Margins | None = None  # None where they are not known
+    dt: float = 0.0  # 0 of a continuous loop
+    is_measured: bool = False  # whether the values are points of data
 
     @property
     def color(self) -> Any:

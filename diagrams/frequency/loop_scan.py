@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From L and dL/d(log ω) to a value and its slope over log ω."""
 PER_DECADE = 40
-"""Frequencies of a scan, besides those around poles and zeros."""
+"""Frequencies of a scan, without those around poles and zeros."""
 TURNS_MATTER = 0.3
 """|L| below which the turns that a delay makes don't matter for the encirclements of −1."""
 HALVINGS = 24
@@ -48,7 +48,7 @@ class Response(Protocol):
 
     @property
     def late(self) -> float:
-        """Delay in s by which L turns at most, besides the turns that its poles and zeros make."""
+        """Delay in s by which L turns at most, not counting the turns that its poles and zeros make."""
 
     @property
     def settled(self) -> float:
@@ -134,11 +134,9 @@ class _Search:
         L: np.ndarray,
         dL: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return samples of L and its slope, and more between those where |L| may fall below the least.
-
-        A response that passes 0 has a root next to it each time, and most of these turn out to be too small. All are
-        computed at once, which takes far less time than to refine one root after the other.
-        """
+        """Return samples of L and its slope, and more between those where |L| may fall below the least."""
+        # a response that passes 0 has a root next to it each time, most of them too small: all are computed at once,
+        # which takes far less time than to refine one root after the other
         for _ in range(HALVINGS):
             shown = self.show(omega, L, dL)[1] & (self._bound(omega, L, dL)[0] < self.least)
             if not shown.any():
@@ -153,11 +151,9 @@ class _Search:
         L: np.ndarray,
         dL: np.ndarray,
     ) -> tuple[_Search, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the search for fewer of many roots with |L| < 1, and samples: the largest |L| of them decides.
-
-        A root that is certain, between samples of both signs, has an |L| above the lower bound there. Those with an
-        upper bound below it are left out.
-        """
+        """Return the search for fewer of many roots with |L| < 1, and samples: the largest |L| of them decides."""
+        # a root that is certain, between samples of both signs, has an |L| above the lower bound there; those with an
+        # upper bound below it are left out
         search = self
         for _ in range(NARROWINGS):
             h, shown = search.show(omega, L, dL)
@@ -343,7 +339,7 @@ class LoopScan:
     def _find_rounding(self, omega: np.ndarray, L: np.ndarray) -> np.ndarray:
         """Return bounds of the relative rounding error of L at frequencies, at least that of a constant.
 
-        Beside a pole on the axis it turns the phase, and a crossing that is less than it isn't there.
+        Next to a pole on the axis it turns the phase, and a crossing that is less than it isn't there.
         """
         return np.asarray(np.maximum(1e-11, self.r.rounding(1j * omega) / np.abs(L)))
 

@@ -620,7 +620,7 @@ def _plot_gang_of_four(systems: Sequence[Mapping[str, Any]], names: Sequence[str
             own = [found[key] for found in systems]
             spans = _span([found["L"] for found in systems], (), omega)
             for i, (system, w) in enumerate(zip(own, spans, strict=True)):
-                if omega is None:  # closed loops have resonances of their own, up to π/T
+                if omega is None:  # closed loops have other resonances, up to π/T
                     top = _limit(system) * BELOW if system.dt else float(w[-1])
                     w = realize(system).grid(float(w[0]), top, POINTS)
                 axes.plot(w, np.abs(_response(system, w)), label=names[i], **_style_of(i, system))

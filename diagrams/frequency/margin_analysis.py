@@ -118,7 +118,7 @@ class StabilityMargins(MarginTable):
         return "margins"
 
     def _further_facts(self) -> list[tuple[str, str]]:
-        """Return facts of the loop besides its numbers."""
+        """Return further facts of the loop, next to its numbers."""
         return []
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
@@ -145,7 +145,7 @@ class MarginFinder(ABC, Generic[Found]):
     result: type[Any]
     """Class of the result, `Found`."""
     eigenvalues: str = EIGENVALUES
-    """Computation that tells whether a closed loop is stable."""
+    """Computation that says whether a closed loop is stable."""
     rotated: ClassVar[str] = " with L rotated"
 
     def __init__(self, r: Realization | DelayedRealization):

@@ -253,11 +253,9 @@ def _disk(loop: LinearSystem, response: _Response, delay: int, skew: float) -> M
 
 
 def _mu_slope(M: np.ndarray, change: np.ndarray) -> float:
-    """Return the slope of the bound min σ̄(D M D⁻¹) along a change of M.
-
-    With the best D the bound is a singular value, and the change of D does not count. Of more than two channels it is
-    a difference of fourth order.
-    """
+    """Return the slope of the bound min σ̄(D M D⁻¹) along a change of M."""
+    # with the best D the bound is a singular value, and the change of D does not count; of more than two channels it is
+    # a difference of fourth order
     if len(M) == 2 and M[0, 1] * M[1, 0] != 0:
         d = np.array([np.sqrt(abs(M[1, 0] / M[0, 1])), 1.0])
         U, _, V = np.linalg.svd(d[:, None] * M / d)

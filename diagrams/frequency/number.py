@@ -22,13 +22,10 @@ NOT_IN_DATA = "not in the data"
 
 
 class Confirmation(str):
-    """Text on how a number was confirmed, with ``method``: the same without values that differ between numbers.
-
-    ``at_steps_only`` says whether a signal is known at communication points alone.
-    """
+    """Text on how a number was confirmed, with ``method``: the same without values that differ between numbers."""
 
     method: str
-    at_steps_only: bool
+    at_steps_only: bool  # whether a signal is known at communication points alone
 
     def __new__(cls, text: str, method: str | None = None, *, at_steps_only: bool = False) -> Confirmation:
         """Make a text with its method."""

@@ -62,10 +62,7 @@ def closed_loop_poles(loop: Any, gain: float) -> np.ndarray:
 
 
 def find_locus(loop: Any, gains: np.ndarray | None, view: View, marked: Sequence[float] = ()) -> Locus:
-    """Return the poles over gains, each branch in its column; gains that are not given lie dense where poles move.
-
-    They reach beyond the gains that are marked in the figure, which are among them.
-    """
+    """Return the poles over gains, each branch in its column; gains that are not given lie dense where poles move."""
     low, high = min([GAINS[0], *(0.5 * k for k in marked)]), max([GAINS[1], *(2.0 * k for k in marked)])
     first = (0.0, *np.geomspace(low, high, 121), 1.0, *marked) if gains is None else map(float, gains)
     found = {k: closed_loop_poles(loop, k) for k in first}

@@ -250,10 +250,8 @@ def _share_poles(poles: np.ndarray, lengths: list[int]) -> list[list[complex]] |
 def _place_by_one_input(
     A: np.ndarray, B: np.ndarray, poles: np.ndarray, differ: Callable[[np.ndarray], float]
 ) -> np.ndarray:
-    """Return a feedback that makes a combination of the inputs reach all states, plus the gains of that input.
-
-    The candidates are drawn, the same each time; the one with the smallest gain and the best poles is taken.
-    """
+    """Return a feedback that makes a combination of the inputs reach all states, plus the gains of that input."""
+    # the candidates are drawn, the same each time; the one with the smallest gain and the best poles is taken
     rng = np.random.default_rng(0)
     polynomial = real_polynomial(poles)
     size = max(np.linalg.norm(A), np.max(np.abs(polynomial[1:]) ** (1 / np.arange(1, len(polynomial)))))

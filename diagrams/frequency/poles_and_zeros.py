@@ -71,10 +71,7 @@ class AxisPole:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Poles and zeros of a loop in the s plane, those on the axis gathered and apart from the others.
-
-    ``closed`` are the closed-loop poles.
-    """
+    """Poles and zeros of a loop in the s plane, those on the axis gathered and apart from the others."""
 
     axis_poles: tuple[AxisPole, ...]
     poles: np.ndarray

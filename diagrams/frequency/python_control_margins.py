@@ -168,7 +168,7 @@ def respond_at_once(system: StateSpace) -> StateSpace:
 
     def horner(x: ArrayLike, warn_infinite: bool = True) -> np.ndarray:
         points = np.atleast_1d(np.asarray(x, dtype=complex))
-        if n < 2 or points.ndim > 1:  # python-control has forms of its own for these
+        if n < 2 or points.ndim > 1:  # python-control returns other shapes for these
             return np.asarray(one_by_one(x, warn_infinite))
         at_once = max(1, ENTRIES_AT_ONCE // n**2)
         try:
@@ -176,7 +176,7 @@ def respond_at_once(system: StateSpace) -> StateSpace:
                 C @ np.linalg.solve(some[:, None, None] * np.eye(n) - A, B[None]) + D
                 for some in np.split(points, range(at_once, len(points), at_once))
             ]
-        except np.linalg.LinAlgError:  # at a pole, where python-control tells infinity from NaN
+        except np.linalg.LinAlgError:  # at a pole, where python-control distinguishes infinity from NaN
             return np.asarray(one_by_one(x, warn_infinite))
         return np.moveaxis(np.concatenate(parts), 0, 2)
 

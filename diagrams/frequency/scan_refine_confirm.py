@@ -42,13 +42,11 @@ def order_key(value: float) -> float:
 
 
 def refine_sign_change(function: Function, low: float, high: float, *, xtol: float, rtol: float = 1e-14) -> float:
-    """Return where a function changes its sign between two values, by Brent's method.
-
-    A scan computes many values at once, which may round otherwise than one by one. An end at which the function is 0
-    but for rounding can then have lost the sign that the scan saw; it is the place that is looked for.
-    """
+    """Return where a function changes its sign between two values, by Brent's method."""
     from scipy.optimize import brentq
 
+    # A scan computes many values at once, which may round otherwise than one by one. An end at which the function is 0
+    # but for rounding can then have lost the sign that the scan saw; it is the place that is looked for.
     first, last = function(low), function(high)
     if (first < 0.0) == (last < 0.0):
         return low if abs(first) <= abs(last) else high
@@ -117,10 +115,7 @@ def pick_test_values(value: float, others: Sequence[float], nominal: float) -> t
 def confirm_limit(
     name: str, value: float, others: Sequence[float], nominal: float, stable: Callable[[float], bool], how: str
 ) -> Confirmation:
-    """Confirm that stability ends at a limit, seen from the nominal value; return the computation.
-
-    Raises `ConfirmationError` if the loop is not stable on the near side and unstable on the far side.
-    """
+    """Confirm that stability ends at a limit, seen from the nominal value; return the computation."""
     inside, outside = pick_test_values(value, others, nominal)
     found = stable(inside), stable(outside)
     if found != (True, False):

@@ -59,10 +59,7 @@ def find_level_eigenvalues(r: Realization, a: float, b: float, gamma: float) -> 
 
 
 def find_level_frequencies(r: Realization, a: float, b: float, gamma: float) -> np.ndarray | None:
-    """Return the frequencies at which a singular value of (a + b L)(1 + L)⁻¹ is gamma, rad/s.
-
-    None where `find_level_eigenvalues` gives none.
-    """
+    """Return the frequencies in rad/s at which a singular value of (a + b L)(1 + L)⁻¹ is gamma; None as above."""
     eigenvalues = find_level_eigenvalues(r, a, b, gamma)
     if eigenvalues is None:
         return None

@@ -67,11 +67,9 @@ def hold_inputs(A: np.ndarray, B: np.ndarray, T: float) -> tuple[np.ndarray, np.
 
 
 def read_matrices(system: LinearSystem) -> Matrices:
-    """Return the matrices of a system of python-control; a transfer function is realized first.
-
-    A transfer function with one channel is realized around z = 1 (`realize`), others by python-control. So is a sampled
-    state space in companion form, which is a transfer function in z, as `control.ss` makes of one.
-    """
+    """Return the matrices of a system of python-control; a transfer function is realized first."""
+    # one with one channel is realized around z = 1 (`realize`), others by python-control; so is a sampled state space
+    # in companion form, which is a transfer function in z, as `control.ss` makes of one
     polynomials = _read_polynomials(system)
     if polynomials is not None:
         sampled = system.dt is True or bool(system.dt)
@@ -128,19 +126,13 @@ def findings_of(system: LinearSystem) -> tuple[Finding, ...]:
 
 
 def read_coefficients(system: LinearSystem) -> Coefficients | None:
-    """Return the coefficients of a sampled transfer function with one channel; None of any other system.
-
-    A state space in companion form is one, too.
-    """
+    """Return the coefficients of a sampled transfer function (or companion form) with one channel; None of others."""
     polynomials = _read_polynomials(system) if getattr(system, "dt", None) else None
     return None if polynomials is None else Coefficients(*(tuple(float(c) for c in row) for row in polynomials))
 
 
 def _read_polynomials(system: LinearSystem) -> tuple[Sequence[float | Fraction], Sequence[float | Fraction]] | None:
-    """Return numerator and denominator of a system with one channel that is given by them, the highest power first.
-
-    That is a transfer function, or a sampled state space in companion form; None of any other system.
-    """
+    """Return numerator and denominator, as `read_coefficients` has them, the highest power first; None of others."""
     import control
 
     if (getattr(system, "ninputs", 0), getattr(system, "noutputs", 0)) != (1, 1):

@@ -58,10 +58,7 @@ def _with_delays(form: CompanionForm, taps: Sequence[float]) -> CompanionForm:
 
 
 def _companion(overs: Sequence[list[Fraction]], under: list[Fraction]) -> CompanionForm:
-    """Return the companion form of transfer functions of one denominator, an output for each numerator.
-
-    Polynomials have the lowest power first.
-    """
+    """Return the companion form of numerators over one denominator, polynomials with the lowest power first."""
     n = len(under) - 1
     monic = [c / under[-1] for c in under[:n]]
     scaled = [[c / under[-1] for c in over] + [Fraction(0)] * (n + 1 - len(over)) for over in overs]

@@ -45,38 +45,27 @@ class ReportedExperiment(Protocol):
 
 
 class Basis(NamedTuple):
-    """A diagram whose implementations are analysed.
-
-    ``suffix`` ends the keys of its variants, and ``lacks`` their titles: it says what is left out of the diagram, and
-    is empty for the diagram as it is. ``is_design`` is as of `Variant`.
-    """
+    """A diagram whose implementations are analysed."""
 
     diagram: WiredDiagram
-    suffix: str = ""
-    lacks: str = ""
+    suffix: str = ""  # ends the keys of its variants
+    lacks: str = ""  # ends their titles: what is left out of the diagram
     is_design: bool = True
 
 
 class InjectionPlan(NamedTuple):
-    """A test signal: the variant that it is added to, frequencies in rad/s, and the amplitude.
-
-    ``left_out`` is the number of frequencies whose periods have more than ``samples`` samples: they would take too
-    long.
-    """
+    """A test signal, and the variant that it is added to."""
 
     variant: Variant
-    frequencies: np.ndarray
+    frequencies: np.ndarray  # in rad/s
     amplitude: float
-    left_out: int = 0
+    left_out: int = 0  # frequencies whose periods have more than ``samples`` samples: they would take too long
     samples: int = 0
 
     def shortened(self, samples: int) -> InjectionPlan:
-        """Return the test signal with the frequencies whose periods have so many samples at most; the last one stays.
-
-        A variant in continuous time has no samples, and keeps all frequencies.
-        """
+        """Return the test signal with the frequencies whose periods have so many samples at most; at least the last."""
         w, dt = self.frequencies, self.variant.model.dt
-        if not dt:
+        if not dt:  # continuous time has no samples
             return self
         kept = w[w * dt * samples >= 2 * np.pi]
         kept = kept if len(kept) else w[-1:]
@@ -92,15 +81,8 @@ def most_samples(variant: Variant) -> int:
 class Case:
     """A diagram with its variants, for the parts of a report.
 
-    It knows nothing of the diagram but its structure. A kind of diagram that is known better has a case of its own: a
+    It knows nothing of the diagram but its structure. A kind of diagram that is known better has its own case: a
     subclass that overrides `bases`, `named_wires` and `excitation`.
-
-    ``point``: where it is analysed; the start without it.
-    ``wires``: wires at which loops are looked at, instead of all named ones on loops.
-    ``stairs``: treatment of stairs in the linear models, as of `Diagram.linearize`.
-    ``variants``: all variants by key, those that can't be analysed as well; the diagram as it is comes first.
-    ``keys``: keys of the sections that the report is to have.
-    ``notify``: told what is being done, where a section takes long.
     """
 
     inputs: tuple[str, ...] = ()
@@ -120,10 +102,10 @@ class Case:
         self.diagram, self.point, self.experiment, self.wires = diagram, point, experiment, wires
         self.stairs, self.requirements = stairs, requirements
         self.notes: list[str] = []
-        self.keys: tuple[str, ...] = ()
+        self.keys: tuple[str, ...] = ()  # of the sections that the report is to have
         self.axes = AxisUnits()
-        self.notify: Callable[[str], None] = lambda doing: None
-        self.variants: dict[str, Variant] = {}
+        self.notify: Callable[[str], None] = lambda doing: None  # gets what is being done, where a section takes long
+        self.variants: dict[str, Variant] = {}  # those that can't be analysed, too; the diagram as it is comes first
         own = self.own_delay()
         for basis in self.bases():
             for implementation, make in _implementations(basis.diagram, own):
@@ -167,7 +149,7 @@ class Case:
         return dict(self.loop_wires())
 
     def extra_loops(self) -> tuple[str, ...]:
-        """Return the keys of loops that a part of its own adds to those at the wires."""
+        """Return the keys of loops that further parts of the report add to those at the wires."""
         return ()
 
     def name_place(self, place: str) -> str:
@@ -200,10 +182,8 @@ class Case:
                 yield variant
 
     def excitation(self, variant: Variant, wire: str) -> InjectionPlan:
-        """Return the test signal of the injection check: small, and spread around the poles of the diagram.
-
-        Where a diagram is much slower than its samples, it is spread above the poles: a period is not that long.
-        """
+        """Return the test signal of the injection check: small, and spread around the poles of the diagram."""
+        # where a diagram is much slower than its samples, it is spread above the poles: a period is not that long
         dt = variant.model.dt
         w = np.abs(in_s(variant.model.poles, dt))
         fastest = np.pi / dt if dt else np.inf

@@ -39,7 +39,7 @@ from .variant import Cut, Variant
 
 STABLE = Limit(-math.inf, 0.0)
 MANY = 10.0
-"""Times of its own uncertainty that a measurement has to be off by to refute a linear model."""
+"""Multiple of a measurement's uncertainty by which it has to be off to refute a linear model."""
 
 LEAST_POLE = 1e-9
 """Size of a pole, relative to the largest, below which it sets no frequency."""
@@ -235,7 +235,7 @@ def _measured(
 
 @dataclass(frozen=True)
 class _State:
-    """What stands between a variant's numbers and a verdict: a reason, its verdict, and more in words."""
+    """What keeps a variant's numbers from a verdict by comparison: a reason, its verdict, and more in words."""
 
     verdict: Verdict | None = None
     reason: Reason = Reason.COMPARED
@@ -285,7 +285,7 @@ def _stable(v: Variant, state: _State, numbers: Mapping[str, Number]) -> Require
 def _with(
     state: _State, result: RequirementResult, found: tuple[str, Number] | None, refuted: bool = False
 ) -> RequirementResult:
-    """Return a result with the verdict on the number that was found, if nothing stands between them."""
+    """Return a result with the verdict on the number that was found, if nothing keeps it from one."""
     if state.verdict is Verdict.FAILED or (state.verdict is not None and found is None):
         return replace(result, verdict=state.verdict, reason=state.reason, detail=state.detail)
     if found is None:

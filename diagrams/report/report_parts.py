@@ -1,6 +1,6 @@
 """Parts of a report: each applies to a case or doesn't, and makes a section, or adds to the one of its key.
 
-A kind of diagram that is known better than by its structure has a report of its own: a `ReportKind` with its own case,
+A kind of diagram that is known better than by its structure has its own report: a `ReportKind` with its own case,
 parts and definitions, which the diagram gives as its ``report_kind``. The parts of this package serve there as well.
 """
 
@@ -54,7 +54,7 @@ class ReportPart(Generic[C_contra]):
 class ReportKind(Generic[C]):
     """A kind of report.
 
-    ``parts``: the parts in the order in which they stand in the report.
+    ``parts``: the parts in the order of the report.
     ``definitions``: definitions of the terms in the paths of numbers.
     ``titles``: titles of sections, by their keys, in place of those that their parts give.
     """

@@ -35,7 +35,7 @@ class Implementation(StrEnum):
     DELAYED = "sampled_d1"
     """As it is sampled, with a sample of computational delay."""
     OWN = "sampled_own"
-    """As it is sampled, with delays of its own that are neither none nor one sample each."""
+    """As it is sampled, with its own delays, which are neither none nor one sample each."""
 
     @property
     def delay(self) -> int:
@@ -185,10 +185,8 @@ class Variant:
         return False
 
     def loops_elsewhere(self, wire: str, others: Iterable[str]) -> tuple[str, ...]:
-        """Return those of other wires that each loop through a wire without a loop at ticks goes through.
-
-        It is empty where the wire has a loop, and where a loop goes through none of the others.
-        """
+        """Return those of other wires that each loop through a wire without a loop at ticks goes through."""
+        # none where the wire has a loop, and where a loop goes through none of the others
         others = tuple(others)
         if not others or not self.acts_between_ticks(wire):
             return ()

@@ -25,7 +25,7 @@ class ContactLimits:
     ----------
     given : mapping
         ``stiffness`` (N/m), ``damping`` (N s/m), ``mass`` and ``tool_mass`` (kg): the loop is stable at least up to so
-        much, or its limit lies in a range of two numbers. ``with`` has the properties that the environment has besides,
+        much, or its limit lies in a range of two numbers. ``with`` has further properties of the environment,
         such as ``{"damping": 10.0}``.
     port : str, optional
         Place of the limits, for errors.

@@ -1,4 +1,4 @@
-"""TOML files of a design review: requirements, and tables of studies beside them. Errors name the file and the line."""
+"""TOML files of a design review: requirements and tables of studies. Errors name the file and the line."""
 
 from __future__ import annotations
 
@@ -25,17 +25,7 @@ REQUIRED = "requirements"
 
 @dataclass(frozen=True)
 class TomlFile:
-    """A TOML file that was read, with the lines of its entries.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    content : mapping
-        Its tables.
-    text : str
-        Its text.
-    """
+    """A TOML file that was read, with the lines of its entries."""
 
     path: Path
     content: Mapping[str, Any]

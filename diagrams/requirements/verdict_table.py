@@ -40,7 +40,7 @@ def by_loop(ranked: Sequence[RequirementResult]) -> list[RequirementResult]:
 
 
 def reason_in_table(result: RequirementResult) -> str:
-    """Return the reason of a verdict that stands below the table; empty where it is none, or a word in the row."""
+    """Return the reason of a verdict that goes below the table; empty where it is none, or a word in the row."""
     if result.verdict is not Verdict.UNDECIDED and (result.variant == CONTACT or not result.detail):
         return ""
     return explain(result)

@@ -66,7 +66,7 @@ LEVELS = (-1000.0, -100.0, -10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0, 100.0, 1000.0
 
 
 def tint(color: Any, share: float) -> tuple[float, ...]:
-    """Return a color so far from white; opacity would make a group of its own in a PDF, whose edges show."""
+    """Return a color so far from white; opacity would make a group in a PDF, whose edges show."""
     from matplotlib.colors import to_rgb
 
     return tuple(1.0 - share * (1.0 - c) for c in to_rgb(color))

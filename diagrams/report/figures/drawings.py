@@ -20,10 +20,7 @@ WIDEST, TALLEST = 1000.0, 700.0
 
 
 def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
-    """Return a report with the drawing of its diagram in the section about it, or in the first one.
-
-    A large one is drawn with closed subsystems, and the inside of each subsystem by itself.
-    """
+    """Return a report with the drawing of its diagram in the section about it, or in the first one."""
     if not report.sections:
         return report
     at = next((i for i, section in enumerate(report.sections) if section.key == "subject"), 0)

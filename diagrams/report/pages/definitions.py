@@ -24,13 +24,11 @@ DEFINITIONS = read_definitions(__package__)
 def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tuple[str, str] | None:
     """Return the term that defines a number, and its definition; None where none is known.
 
-    A term stands for the names that go on behind it, too: ``gain_crossover`` for ``gain_crossover_1``. A term of two
+    A term defines the names that begin with it, too: ``gain_crossover`` defines ``gain_crossover_1``. A term of two
     parts, such as ``gain_crossover.phase_margin_deg``, comes before those of one.
     """
     parts = path.split(".")
-    if (
-        parts[0] == "subject" and parts[-1] != "sample_time"
-    ):  # subsystems, blocks and parameters have names of their own
+    if parts[0] == "subject" and parts[-1] != "sample_time":  # subsystems, blocks and parameters have their own names
         parts = ["subject"]
     elif parts[0] == "inner" and parts[-2:-1] == ["control"] and len(parts) > 4:  # inner.WIRE.VARIANT….control.NUMBER
         parts = ["control"]
@@ -51,7 +49,7 @@ def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tup
 
 
 def _beginnings(name: str) -> Iterator[str]:
-    """Yield a name, and what stands ahead of each of its underscores, the longest first."""
+    """Yield a name, and what is ahead of each of its underscores, the longest first."""
     while name:
         yield name
         name = name.rpartition("_")[0]

@@ -142,7 +142,7 @@ class Section:
     """By path within the section, such as ``par.sampled_d0.phase_margin_deg``; those of the tables are among them."""
     sections: tuple[Section, ...] = ()
     overview: tuple[Plot, ...] = ()
-    """Small figures of it that stand in the summary."""
+    """Small figures of it for the summary."""
     absent: Mapping[str, str] = field(default_factory=dict)
     """Reasons why numbers are missing, by the beginnings of their paths within the section."""
 

@@ -23,7 +23,7 @@ MOST = 24
 TOP, BOTTOM = 18.0 / 25.4 * 72, 18.0 / 25.4 * 72
 """Margins of a page in points, as in the style sheet."""
 MARK = 2.0
-"""Height of a mark in points; marks stand in the text's left edge ahead of each figure and table."""
+"""Height of a mark in points; marks are at the text's left edge ahead of each figure and table."""
 
 SHEETS = 2
 """Sheets of a summary."""
@@ -78,7 +78,7 @@ def fill_pages(html: str, lay_out: Any, canvas: Any) -> str:
     """Return a page for print whose gaps at the ends of sheets are small where that can be had.
 
     A figure that just misses the end of a sheet is set smaller, by `LEAST` at most; a table of more than `ROWS` rows
-    that leaves much of a sheet empty may go over to the next one, where its head stands again.
+    that leaves much of a sheet empty may go over to the next one, where its head is repeated.
     """
     places = list(_PLACE.finditer(html))
     if not places:

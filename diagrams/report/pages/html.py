@@ -44,7 +44,7 @@ def _environment() -> Environment:
 
 
 def marked(text: str) -> Markup:
-    """Escape a text; what stands between backticks is code, and numbers and symbols such as M_s stand as in print."""
+    """Escape a text; what is between backticks is code; numbers and symbols such as M_s are as in print."""
     from markupsafe import Markup, escape
 
     parts = re.split(r"`([^`]+)`", str(escape(text)))

@@ -14,9 +14,7 @@ from .document import Document
 
 
 def to_json(report: Document) -> str:
-    """Return all numbers, nested by the dots of their paths, with ``meta`` next to them.
-
-    Beside them stands ``requirements``, where there were some: the verdict, the counts, and each requirement.
+    """Return all numbers, nested by the dots of their paths, with ``meta`` and ``requirements`` next to them.
 
     Every leaf is ``{"value", "unit", "tolerance", "confirmed_by"}``. JSON has no infinity: it is the text "inf" or
     "-inf", which ``float()`` reads; what does not exist (NaN) is null.
@@ -38,7 +36,7 @@ def to_json(report: Document) -> str:
 
 
 def leaf(number: Number) -> dict[str, Any]:
-    """Return a number as it stands in the JSON."""
+    """Return a number as it is in the JSON."""
     return {key: _plain(value) for key, value in number.as_dict().items()}
 
 

@@ -17,7 +17,7 @@ from .printed_values import cell, mark, reason, tolerance_text, value_text
 from .svg import EmbeddedFigure, embedded
 
 ELSEWHERE = frozenset({"definitions", "versions", "variants", "fmus"})
-"""Entries of ``meta`` that stand in sections."""
+"""Entries of ``meta`` that sections show."""
 ITEM = "- "
 """Beginning of a text that is an item of a list."""
 
@@ -42,7 +42,7 @@ class LinkView:
 
 @dataclass(frozen=True)
 class DetailsView:
-    """Tables and figures of a section that stand in the appendix."""
+    """Tables and figures of a section that are in the appendix."""
 
     title: str
     anchor: str
@@ -67,7 +67,7 @@ class SectionView:
     groups: tuple[tuple[FigureView, ...], ...] = ()
     """Small figures that stand side by side."""
     details: tuple[LinkView, ...] = ()
-    """Tables of it that stand in the appendix."""
+    """Tables of it that are in the appendix."""
 
     @property
     def kept(self) -> bool:
@@ -117,9 +117,9 @@ class Page:
     summary: SectionView | None
     """The section that can stand alone; None where the report has none."""
     sections: tuple[SectionView, ...]
-    """The chapters: all other sections; none where the summary stands alone."""
+    """The chapters: all other sections; none where there is only the summary."""
     numbers: tuple[tuple[NumberView, ...], ...]
-    """All numbers, by the sections that they stand in."""
+    """All numbers, by their sections."""
     reasons: tuple[str, ...]
     """Computations that confirmed the numbers."""
     terms: tuple[TermView, ...]
@@ -245,7 +245,7 @@ def _term(path: str, more: Mapping[str, str]) -> TermView | None:
 
 
 def _grouped(texts: Sequence[str]) -> Any:
-    """Yield paragraphs and the lists among them, told apart by True, without the marks of their items."""
+    """Yield paragraphs and the lists among them, with True for lists, without the marks of their items."""
     for listed, group in groupby(texts, lambda text: text.startswith(ITEM)):
         yield listed, [text.removeprefix(ITEM) if listed else text for text in group]
 

@@ -31,7 +31,7 @@ class Heading:
 
 @dataclass(frozen=True)
 class CellView:
-    """A cell; ``kind`` is "right" for numbers, "again" where it repeats what stands above it.
+    """A cell; ``kind`` is "right" for numbers, "again" where it repeats the cell above.
 
     Of a number ``about`` has the path, the tolerance and the confirmation; ``anchor`` is where it is in the
     appendix, empty where it doesn't.
@@ -63,7 +63,7 @@ class TableView:
     headings: tuple[Heading, ...]
     rows: tuple[tuple[CellView, ...], ...]
     reasons: tuple[NoteView, ...]
-    """Reasons of verdicts, each a line of its own below the table."""
+    """Reasons of verdicts, each a line below the table."""
     note: str
     confirmations: tuple[NoteView, ...]
     is_long: bool
@@ -76,11 +76,7 @@ class TableView:
 
 
 class Numbered:
-    """Tables of a page in the making, numbered from 1.
-
-    ``numbers``: the report's numbers by path, which those in tables lead to.
-    ``linked``: whether the page has the appendix that they lead to.
-    """
+    """Tables of a page in the making, numbered from 1; where ``linked``, the page has the appendix they lead to."""
 
     def __init__(self, numbers: Mapping[str, Number], *, linked: bool = True):
         self.count, self.linked = 0, linked

@@ -78,7 +78,7 @@ def tolerance_text(number: Number) -> str:
 
 
 def cell(value: Any) -> str:
-    """Return anything that stands in a table as text."""
+    """Return the content of a table's cell as text."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool_):

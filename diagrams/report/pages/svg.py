@@ -24,10 +24,7 @@ WIDE = 900.0
 
 @dataclass(frozen=True)
 class EmbeddedFigure:
-    """A figure as a page holds it: SVG for the screen, and another one for paper where it is turned there.
-
-    ``paper``: SVG of a wide figure for paper, with ids of its own.
-    """
+    """A figure as a page holds it: SVG for the screen, and one with other ids for paper where it is turned there."""
 
     screen: Markup
     paper: Markup | None = None

@@ -47,11 +47,7 @@ def write_digits(value: float, most: int) -> str:
 
 @dataclass(frozen=True)
 class Texts:
-    """The texts of a section: macros of a template, filled with facts.
-
-    ``package``: import name of the package that has the template.
-    ``name``: the template's name, without its ending.
-    """
+    """The texts of a section: macros of a template in a package, filled with facts."""
 
     package: str
     name: str

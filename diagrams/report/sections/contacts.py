@@ -184,15 +184,11 @@ def check_contacts(diagram: WiredDiagram, contacts: Mapping[str, Any]) -> Mappin
 
 @dataclass
 class ReportedContacts:
-    """Contacts of a report, with the limits that are required of them.
-
-    ``limits``: required limits by the contacts' names; those of all contacts have the name "".
-    ``weakest``: facts of each contact on the first page, once its section is made.
-    """
+    """Contacts of a report, with the limits that are required of them, by their names; "" is that of all contacts."""
 
     contacts: Mapping[str, Contact]
     limits: Mapping[str, tuple[ContactLimits, ...]]
-    weakest: list[Mapping[str, Any]] = field(default_factory=list)
+    weakest: list[Mapping[str, Any]] = field(default_factory=list)  # of each contact, for the first page
     refuted: set[str] = field(default_factory=set)
 
     def limits_of(self, name: str) -> tuple[ContactLimits, ...]:
@@ -355,10 +351,7 @@ def _required(contact: Contact, required: Sequence[ContactLimits]) -> Iterator[d
 
 
 def _tried(contact: Contact, required: Sequence[ContactLimits]) -> tuple[list[Table], tuple[str, ...], list[str]]:
-    """Return the table of the limit that was tried in the nonlinear run, remarks on it, and paths that it refutes.
-
-    The first limit of stiffness that is required is tried, or that with a damper.
-    """
+    """Return the table of the limit that was tried in the nonlinear run, remarks on it, and paths that it refutes."""
     wanted = (dict(one.environment) for one in required if "stiffness" in one.limits)
     environment: dict[str, Any] = next(wanted, {"damping": TRIED_DAMPING})
     place, words = _place("stiffness", environment), _describe(environment)

@@ -330,10 +330,7 @@ def left_out(case: Case, wire: str) -> list[str]:
 
 
 def _no_margins(wire: str, v: Variant, error: LoopwrightError) -> str:
-    """Return why a wire has no margins in a variant, for readers of a report; a hint for its author comes last.
-
-    An error's text has what was found, what was expected, and one next step.
-    """
+    """Return why a wire has no margins in a variant, for readers of a report; a hint for its author comes last."""
     why = say_found(error)
     if isinstance(error, BetweenTicksError):
         return TEXTS.line("between_ticks", wire=wire, variant=v.title, why=why)

@@ -39,16 +39,12 @@ SOURCE = "the data's uncertainty, and the distance of their points"
 
 @dataclass(frozen=True, eq=False)
 class MeasuredLoop:
-    """A loop that was measured.
-
-    ``key``: its part of dotted paths: that of the loop in the report, where the wire is one of them.
-    ``uncertainty``: relative uncertainty of each point; None where the data don't say it.
-    """
+    """A loop that was measured; its key is that of the loop in the report, where the wire is one of them."""
 
     wire: str
     key: str
     data: Any
-    uncertainty: np.ndarray | None
+    uncertainty: np.ndarray | None  # relative, of each point; None where the data don't say it
     margins: MeasuredMargins
 
     def intervals(self, dt: float = 0.0) -> dict[str, Interval]:

@@ -101,10 +101,8 @@ def list_poles(poles: Iterable[complex], dt: float = 0.0) -> str:
 
 
 def unstable_first(case: Case) -> Section | None:
-    """Return the text that names unstable variants and their poles, None where there are none.
-
-    It is the beginning of a report: margins and other numbers of an unstable diagram mean nothing.
-    """
+    """Return the text that names unstable variants and their poles, None where there are none."""
+    # it is the beginning of a report: margins and other numbers of an unstable diagram mean nothing
     text = []
     for v in case.usable():
         if Stability.of(v) is Stability.UNSTABLE:

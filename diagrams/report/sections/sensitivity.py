@@ -106,10 +106,8 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
 
 
 def _take_confirmed(rows: list[Sensitivity], confirmed: list[Sensitivity]) -> list[Sensitivity]:
-    """Return sensitivities with the confirmation of the same ones of an earlier loop; none if one isn't there.
-
-    A loop that is cut at another of its wires has the same numbers with the same slopes.
-    """
+    """Return sensitivities with the confirmation of the same ones of an earlier loop; none if one isn't there."""
+    # a loop that is cut at another of its wires has the same numbers with the same slopes
     made = []
     for row in rows:
         same = (

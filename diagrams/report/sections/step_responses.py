@@ -236,7 +236,7 @@ class Quantized:
 def _said_of_quanta(
     v: Variant, test: StepTest, got: StepResponse, quantized: Quantized, saturated: list[str]
 ) -> Iterator[str]:
-    """Yield what quanta do to a step: it was made larger, is small beside them, or reaches limits ahead of them."""
+    """Yield what quanta do to a step: it was made larger, is small against them, or reaches limits ahead of them."""
     least, quantum, usual = quantized.least, quantized.quantum, quantized.usual
     if quantum is None:
         return
@@ -378,11 +378,9 @@ def _grows_on(
     length: float,
     notify: Callable[[], None],
 ) -> bool:
-    """Return whether an answer that ends away from the linear model's grows without end.
-
-    It is followed for longer then. It does if it gets `BEYOND_ALL` times as large as the linear model's, or grows as a
-    ramp does at least.
-    """
+    """Return whether an answer that ends away from the linear model's grows without end."""
+    # it is followed for longer then; it does if it gets `BEYOND_ALL` times as large as the linear model's, or grows as
+    # a ramp does at least
     if got.prediction is None:
         return False
     linear = float(np.max(np.abs(got.answer(bool(test.output), linear=True))))
@@ -480,11 +478,9 @@ def _diverging(got: StepResponse, test: StepTest, v: Variant, diverges: float | 
 
 
 def _small_response(got: StepResponse, respond: Callable[[float], StepResponse], least: float) -> StepResponse:
-    """Return a response to a smaller step of at least a height, if it comes nearer to the linear model; else the same.
-
-    A step that reaches limits of the diagram says little about the loop: 1 % of 1 + the signal's size is much where
-    signals are small in SI units.
-    """
+    """Return a response to a smaller step, of at least a height, if it is nearer to the linear model; else the same."""
+    # a step that reaches limits of the diagram says little about the loop: 1 % of 1 + the signal's size is much where
+    # signals are small in SI units
     for _ in range(TIMES_SMALLER):
         if got.prediction is None or _deviation(got) <= APART or SMALLER * abs(got.size) < least:
             break
@@ -616,7 +612,7 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant, slowest: float | Non
 def _deviation(got: StepResponse) -> float:
     """Return the largest difference of co-simulation and linear model, relative to the largest change of its signal.
 
-    Entries of one signal share their largest change: one that hardly moves beside the others has no scale of its own.
+    Entries of one signal share their largest change: one that hardly moves next to the others has no scale.
     A signal that moves by rounding only does not count.
     """
     assert got.prediction is not None  # callers look

@@ -110,10 +110,8 @@ def _requirements(reviewed: Review, most: int) -> Table:
 def _overview(
     case: Case, numbers: Mapping[str, Number], sections: Sequence[Section]
 ) -> tuple[tuple[Plot, ...], list[str]]:
-    """Return the small figures of each loop, side by side, and the wires of loops for which there is no room.
-
-    A loop that another one shows has none. Those with the smallest disk margins are shown, then required steps.
-    """
+    """Return the small figures of each loop, side by side, and the wires of loops for which there is no room."""
+    # a loop that another one shows has none; those with the smallest disk margins are shown, then required steps
     groups: dict[str, list[Plot]] = {}
     for plot in _small_figures(sections):
         groups.setdefault(plot.group, []).append(plot)
@@ -165,7 +163,7 @@ def _row(result: RequirementResult) -> tuple[Any, ...]:
     verdict, *others = row_of(result)
     why = reason_in_table(result)
     said = Judged(str(verdict), verdict, why)
-    if not why and (word := explain(result)):  # which stands in the row
+    if not why and (word := explain(result)):  # which the row has
         said = Judged(f"{verdict}: {word}", verdict)
     return (said, *others)
 

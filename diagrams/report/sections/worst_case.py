@@ -119,10 +119,7 @@ def _name_wires(
 
 @dataclass(frozen=True)
 class MissingWorstCase:
-    """Worst case that a file asks for, and that could not be looked for.
-
-    ``limits``: limits that it was to be looked for with, by loops and numbers.
-    """
+    """Worst case that a file asks for, and that could not be looked for; its limits by loops and numbers."""
 
     limits: Mapping[tuple[str, ...], Mapping[str, Limit | None]]
     problem: str
@@ -148,10 +145,7 @@ class MissingWorstCase:
 
 @dataclass(frozen=True)
 class ReportedWorstCase:
-    """Worst case of a report.
-
-    ``run``: its run; None where it has none.
-    """
+    """Worst case of a report, with its run where it has one."""
 
     found: WorstCase
     run: RunConfirmation | None = None
