@@ -21,7 +21,7 @@ from .bound_functions import CALL, TICK, FunctionInC, TickStructure, at
 from .grouped_functions import GroupedTick
 from .newton import NewtonOptions, NewtonStructure
 from .plants_called_back import PythonStep, RemotePlants
-from .rate_differences import Differences
+from .rate_differences import SlopesByDifferences
 from .runtime import load_runtime
 from .staged import NativeModelExchange
 from .tick_code import TickCode
@@ -244,7 +244,7 @@ class CompiledLoop:
             rows=self._array(np.zeros(n, dtype=np.int64)),
             tolerance=options.tolerance,
             rounding=options.rounding,
-            singular=max(options.singular, _SEEN if isinstance(code.loops[clocks], Differences) else 0.0),
+            singular=max(options.singular, _SEEN if isinstance(code.loops[clocks], SlopesByDifferences) else 0.0),
             iterations=options.iterations,
             halvings=options.halvings,
         )

@@ -21,7 +21,7 @@ from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructur
 from .library_method import LibraryMethod, StepFailure
 from .newton import NewtonOptions, NewtonStructure
 from .radau import radau_numbers
-from .rate_differences import Differences
+from .rate_differences import SlopesByDifferences
 from .runtime import load_runtime
 from .staged import NativeModelExchange
 from .staged_functions import Staged
@@ -172,7 +172,7 @@ class CompiledHybrid:
         trial = [np.zeros(1), x.copy(), w if delays is None else w.copy(), p]
         where = flat.continuous
         slope = code.between.get("slope")
-        assert slope is None or isinstance(slope, CompiledFunction | Differences)
+        assert slope is None or isinstance(slope, CompiledFunction | SlopesByDifferences)
         flow = code.between["flow"]
         assert isinstance(flow, CompiledFunction | GroupedPart | Staged)
         slopes = np.zeros(0 if slope is None else n * n if loops else len(slope.pattern[0]))
@@ -209,19 +209,19 @@ class CompiledHybrid:
             self._solver = loop.bind_loops(code.ticks, NONE, trial, loops)
             hybrid.p.loops, hybrid.p.here = ctypes.addressof(self._solver), at(x)
             hybrid.solved = self._own(np.zeros(m))
-            if not isinstance(slope, Differences):
+            if not isinstance(slope, SlopesByDifferences):
                 through = np.zeros(2 * n * m)
                 hybrid.p.by_loops = self._own(through)
                 results += [through[: n * m], through[n * m :], np.zeros(m * m)]
         if slope is not None:
             typical = np.maximum(np.abs(methods[-1].atol) / methods[-1].rtol, 1e-300)
-            if isinstance(slope, Differences):
+            if isinstance(slope, SlopesByDifferences):
                 bound = slope.bind(trial, results, self._bind_block, typical=typical, loops=self._solver)
             else:
                 bound = slope.bind(trial, results)
             hybrid.p.slope = bound.structure
             self._kept.append(bound)
-            if loops is None or isinstance(slope, Differences):
+            if loops is None or isinstance(slope, SlopesByDifferences):
                 rows, columns = slope.pattern
                 hybrid.p.entries = len(rows)
                 hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))

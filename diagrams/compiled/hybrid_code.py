@@ -20,7 +20,7 @@ from .generated_text import write_functions
 from .grouped_functions import GroupedPart
 from .grouping import PartTables, make_part_tables
 from .kernels import BlockKinds, Kernels
-from .rate_differences import Columns, Differences, find_columns
+from .rate_differences import Columns, SlopesByDifferences, find_columns
 from .runtime import load_runtime
 from .small_steps import STEPS, write_steps
 from .staged_functions import Staged
@@ -54,7 +54,7 @@ class HybridCode:
         for clocks, equations in self.ticks.loops.items():
             equations.hand_over(to.ticks.loops[clocks])
         for name, function in self.between.items():
-            if not isinstance(function, Differences):  # their rates are handed over as "flow"
+            if not isinstance(function, SlopesByDifferences):  # their rates are handed over as "flow"
                 function.hand_over(to.between[name])
 
 
@@ -199,12 +199,12 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
         staged = {name: Staged(schedule, [*map(code.find, functions[name])]) for name, schedule in schedules.items()}
         ticks = {clocks: staged.pop(f"tick{i}") for i, clocks in enumerate(kinds)}
         loops = {
-            c: Differences(staged.pop(name), dense(flat.active_loops(c)), values=True)
+            c: SlopesByDifferences(staged.pop(name), dense(flat.active_loops(c)), values=True)
             for name, (c, _) in looped.items()
         }
         between: dict[str, FunctionInC] = {**staged}
         if stiff:
-            between["slope"] = Differences(staged["flow"], columns())
+            between["slope"] = SlopesByDifferences(staged["flow"], columns())
         return HybridCode(TickCode(ticks, exact=False, library=code.library, loops=loops), between)
 
     def write() -> str:
@@ -238,7 +238,7 @@ def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *
         found = {name: GroupedPart(of, kernels, address, counts[name]) for name, of in tables[kernels].items()}
         between: dict[str, FunctionInC] = {**found}
         if stiff:
-            between["slope"] = Differences(found["flow"], columns())
+            between["slope"] = SlopesByDifferences(found["flow"], columns())
         exact = blocks.exact or kernels.generated is None
         return HybridCode(TickCode(ticks.find(kernels), exact, libraries[0].library), between)
 

@@ -57,7 +57,7 @@ class Columns:
 
 
 @dataclass(frozen=True, eq=False)
-class Differences(FunctionInC):
+class SlopesByDifferences(FunctionInC):
     """The derivative of a function by entries of x, by differences; with ``values`` its values come before it."""
 
     rates: FunctionInC
