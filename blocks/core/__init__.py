@@ -52,7 +52,7 @@ from .explained_calls import UnknownArgumentError, explain_calls, offer_elsewher
 from .files import check_file, replace_file, write_text
 from .findings import Finding
 from .frozen import FrozenMapping
-from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of
+from .instants import FINEST, exact_number, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of
 from .layout import Layout, elements, lay_out
 from .numpy_functions import Units, result_unit
 from .one_thread import on_one_thread, one_thread
@@ -168,6 +168,7 @@ __all__ = [
     "describe_shape",
     "elements",
     "enumerate_some",
+    "exact_number",
     "explain_calls",
     "explain_disk_errors",
     "find_disk_error",

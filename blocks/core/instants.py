@@ -58,12 +58,17 @@ def read_time(value: float) -> Fraction | None:
     return found if float(found) == float(value) else None
 
 
+def exact_number(value: float) -> Fraction:
+    """Return the fraction that `read_time` gives, else that of the number's decimal digits."""
+    return read_time(value) or Fraction(repr(float(value)))
+
+
 def next_edge(t: float, period: float, *offsets: float) -> float:
-    """Return the first time after t that is one of the offsets plus k ≥ 0 periods, each number read by `read_time`."""
-    exact = read_time(period) or Fraction(repr(float(period)))
+    """Return the first time after t that is one of the offsets plus k ≥ 0 periods, all of them exact."""
+    exact = exact_number(period)
     best = math.inf
     for offset in offsets:
-        first = read_time(offset) or Fraction(repr(float(offset)))
+        first = exact_number(offset)
         k = max(math.floor((Fraction(t) - first) / exact), 0)
         while float(first + k * exact) <= t:
             k += 1

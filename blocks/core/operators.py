@@ -8,7 +8,7 @@ refused, since a signal's values come with the run; the error says what to write
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, NoReturn, TypeVar
 
 import numpy as np
@@ -29,6 +29,10 @@ class Operators(Generic[S]):
     def _signal(self) -> S:
         raise NotImplementedError
 
+    def _operate(self, block: str, name: str, *operands: Any, **parameters: Any) -> S:
+        made: S = operate(block, name, *operands, **parameters)
+        return made
+
     def __add__(self, other: Any) -> S:
         return _add(self, self, other, "++")
 
@@ -43,7 +47,7 @@ class Operators(Generic[S]):
 
     def __neg__(self) -> S:
         # a sum keeps the unit, which a gain would not
-        return _make(self, "Sum", f"minus_{_operand(self)}", self, signs="-")
+        return self._operate("Sum", f"minus_{_operand(self)}", self, signs="-")
 
     def __pos__(self) -> S:
         return self._signal()
@@ -55,12 +59,12 @@ class Operators(Generic[S]):
         return _multiply(self, other)
 
     def __matmul__(self, other: Any) -> S:
-        return _make(self, "Function", f"{_operand(self)}_times_{_operand(other)}", self, other, function=np.matmul)
+        return self._operate("Function", f"{_operand(self)}_times_{_operand(other)}", self, other, function=np.matmul)
 
     def __rmatmul__(self, other: Any) -> S:
         if not has_signals(other) and np.ndim(other) == 2:
-            return _make(self, "Gain", f"gain_of_{_operand(self)}", self, gain=other)
-        return _make(self, "Function", f"{_operand(other)}_times_{_operand(self)}", other, self, function=np.matmul)
+            return self._operate("Gain", f"gain_of_{_operand(self)}", self, gain=other)
+        return self._operate("Function", f"{_operand(other)}_times_{_operand(self)}", other, self, function=np.matmul)
 
     def __truediv__(self, other: Any) -> S:
         if has_signals(other):
@@ -73,14 +77,16 @@ class Operators(Generic[S]):
     def __pow__(self, other: Any) -> S:
         if not has_signals(other) and np.ndim(other) == 0:
             words = {2.0: "square", 3.0: "cube", 0.5: "root", -1.0: "inverse"}
-            return _make(self, "Power", f"{words.get(float(other), 'power')}_of_{_operand(self)}", self, exponent=other)
-        return _make(self, "Function", f"power_of_{_operand(self)}", self, other, function=np.power)
+            return self._operate(
+                "Power", f"{words.get(float(other), 'power')}_of_{_operand(self)}", self, exponent=other
+            )
+        return self._operate("Function", f"power_of_{_operand(self)}", self, other, function=np.power)
 
     def __rpow__(self, other: Any) -> S:
-        return _make(self, "Function", f"power_of_{_operand(other)}", other, self, function=np.power)
+        return self._operate("Function", f"power_of_{_operand(other)}", other, self, function=np.power)
 
     def __abs__(self) -> S:
-        return _make(self, "Function", f"abs_of_{_operand(self)}", self, function=np.absolute)
+        return self._operate("Function", f"abs_of_{_operand(self)}", self, function=np.absolute)
 
     def __lt__(self, other: Any) -> S:
         return _compare(self, other, "<", "below")
@@ -95,19 +101,19 @@ class Operators(Generic[S]):
         return _compare(self, other, ">=", "at_least")
 
     def __and__(self, other: Any) -> S:
-        return _make(self, "And", f"{_operand(self)}_and_{_operand(other)}", self, other)
+        return self._operate("And", f"{_operand(self)}_and_{_operand(other)}", self, other)
 
     def __rand__(self, other: Any) -> S:
-        return _make(self, "And", f"{_operand(other)}_and_{_operand(self)}", other, self)
+        return self._operate("And", f"{_operand(other)}_and_{_operand(self)}", other, self)
 
     def __or__(self, other: Any) -> S:
-        return _make(self, "Or", f"{_operand(self)}_or_{_operand(other)}", self, other)
+        return self._operate("Or", f"{_operand(self)}_or_{_operand(other)}", self, other)
 
     def __ror__(self, other: Any) -> S:
-        return _make(self, "Or", f"{_operand(other)}_or_{_operand(self)}", other, self)
+        return self._operate("Or", f"{_operand(other)}_or_{_operand(self)}", other, self)
 
     def __invert__(self) -> S:
-        return _make(self, "Not", f"not_{_operand(self)}", self)
+        return self._operate("Not", f"not_{_operand(self)}", self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         if method == "__call__" and not options:
@@ -224,11 +230,8 @@ def has_signals(value: Any) -> bool:
 
 
 def operate(block: str, name: str, *operands: Any, **parameters: Any) -> Any:
-    """Return the output of a block that an operator makes.
-
-    The block's class is looked up in the package by name: operators make blocks, and blocks have operators. Its name in
-    the diagram is numbered where it repeats.
-    """
+    """Return the output of a block that an operator makes; its name in the diagram is numbered where it repeats."""
+    # the block's class is looked up in the package by name: operators make blocks, and blocks have operators
     package = sys.modules[__name__.rpartition(".core.")[0]]
     made = getattr(package, block)(**parameters)
     if len(name) <= _LONGEST:
@@ -247,19 +250,14 @@ def _operand(value: Any) -> str:
     return str(signal.source.label if len(primary) == 1 else signal.port)
 
 
-def _make(owner: Operators[S], block: str, name: str, *operands: Any, **parameters: Any) -> S:
-    made: S = operate(block, name, *operands, **parameters)
-    return made
-
-
 def _add(owner: Operators[S], left: Any, right: Any, signs: str) -> S:
     word = {"++": "plus", "+-": "minus"}[signs]
-    return _make(owner, "Sum", f"{_operand(left)}_{word}_{_operand(right)}", left, right, signs=signs)
+    return owner._operate("Sum", f"{_operand(left)}_{word}_{_operand(right)}", left, right, signs=signs)
 
 
 def _multiply(left: Operators[S], other: Any) -> S:
     if has_signals(other):
-        return _make(left, "Product", f"{_operand(left)}_times_{_operand(other)}", left, other)
+        return left._operate("Product", f"{_operand(left)}_times_{_operand(other)}", left, other)
     other = np.asarray(other) if isinstance(other, list | tuple) else other
     if made := as_block(other, "(u)"):
         raise ShapeError(f"found {system_text(other)}; expected a number, a vector or another signal. {made}.")
@@ -268,15 +266,15 @@ def _multiply(left: Operators[S], other: Any) -> S:
             f"found a factor of shape {np.shape(other)}; expected a number, a vector or another signal. Apply a "
             "matrix as K @ signal."
         )
-    return _make(left, "Gain", f"gain_of_{_operand(left)}", left, gain=other)
+    return left._operate("Gain", f"gain_of_{_operand(left)}", left, gain=other)
 
 
 def _divide(owner: Operators[S], left: Any, right: Any) -> S:
-    return _make(owner, "Function", f"{_operand(left)}_over_{_operand(right)}", left, right, function=np.divide)
+    return owner._operate("Function", f"{_operand(left)}_over_{_operand(right)}", left, right, function=np.divide)
 
 
 def _compare(left: Operators[S], other: Any, relation: str, word: str) -> S:
-    return _make(left, "Compare", f"{_operand(left)}_{word}_{_operand(other)}", left, other, relation=relation)
+    return left._operate("Compare", f"{_operand(left)}_{word}_{_operand(other)}", left, other, relation=relation)
 
 
 def _function(function: Any, word: str, *operands: Any) -> Any:
@@ -364,10 +362,6 @@ def _numpy_call(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any])
         return value
 
     call = NumpyCall(function, tuple(note(a) for a in args), {key: note(v) for key, v in kwargs.items()})
-    names = tuple(_numbered(len(signals)))
+    names = ("u",) if len(signals) == 1 else tuple(f"u{i + 1}" for i in range(len(signals)))
     name = f"{function.__name__}_of_{'_and_'.join(map(_operand, signals))}"
     return operate("Function", name, *signals, function=call.simplified(), arguments=names)
-
-
-def _numbered(count: int) -> Iterator[str]:
-    yield from ("u",) if count == 1 else (f"u{i + 1}" for i in range(count))

@@ -6,6 +6,7 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
@@ -22,7 +23,6 @@ from .errors import (
     near,
 )
 from .explained_calls import explain_calls
-from .index import as_index
 from .operators import Operators, concatenate, has_signals, operate
 
 recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=None)
@@ -104,7 +104,7 @@ class Signal(Wired):
     def __getitem__(self, index: int | slice) -> Signal:
         if self.index is not None:
             raise WiringError("it is a part of a signal already; index the whole port, once.", port=self.port)
-        return Signal(self.source, self.port, as_index(index, self.port), None, self.call)
+        return Signal(self.source, self.port, _as_index(index, self.port), None, self.call)
 
     def __iter__(self) -> Iterator[Signal]:
         who = getattr(self.source, "label", None)
@@ -120,6 +120,24 @@ class Signal(Wired):
     def __repr__(self) -> str:
         part = "" if self.index is None else f"[{self.index}]"
         return f"<signal {getattr(self.source, 'label', self.source)}.{self.port}{part}>"
+
+
+def _as_index(index: Any, port: str) -> int | slice:
+    """Return an index of Python's integers, so that NumPy's integers wire and compare alike."""
+
+    def integer(value: Any) -> int:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError
+        return operator.index(value)
+
+    try:
+        if not isinstance(index, slice):
+            return integer(index)
+        return slice(*(None if i is None else integer(i) for i in (index.start, index.stop, index.step)))
+    except TypeError:
+        raise WiringError(
+            f"found the index {index!r}; expected an integer or a slice of integers, as in y[0] or y[:2].", port=port
+        ) from None
 
 
 def _outputs(source: Wireable) -> list[str]:

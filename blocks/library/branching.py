@@ -30,7 +30,7 @@ def expect_scalar(value: Array, port: str) -> Array:
     if shape_of(value):
         raise ShapeError(
             f"found shape {shape_of(value)}; expected a scalar in a continuous subsystem, where it switches by events. "
-            "Index the signal, as in u[0], and give each entry a block of its own, or put the block into a "
+            "Index the signal, as in u[0], and give each entry its own block, or put the block into a "
             "@subsystem(sample_time=…), where it acts on every entry.",
             port=port,
         )

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, SampleTimeError, Shape, ShapeError, State, parameter, read_time
+from ..core import Array, Block, Input, Output, SampleTimeError, Shape, ShapeError, State, exact_number, parameter
 from .initial_values import StartsAtInput
 
 
@@ -115,7 +115,7 @@ class VariableDelay(StartsAtInput, Block):
             y = y + share * (u.u if n == 0 else x.line[-n])
         return y
 
-    def update(self, t: Array, x: Any, u: Any, T: Array) -> Array:
+    def update(self, t: Array, x: Any, u: Any) -> Array:
         """Return the history with this input."""
         return push(x.line, u.u)
 
@@ -154,8 +154,8 @@ class TransportDelay(Block):
         SampleTimeError
             If the delay is no multiple of the sample time. A float is read as a sample time is.
         """
-        T = sample_time if isinstance(sample_time, Fraction) else _exact(float(sample_time))
-        ratio = _exact(self.delay) / T
+        T = sample_time if isinstance(sample_time, Fraction) else exact_number(sample_time)
+        ratio = exact_number(self.delay) / T
         n = round(ratio)
         if n < 1 or abs(ratio / n - 1) > Fraction(1, 10**9):
             low, high = max(int(ratio), 1), int(ratio) + 1
@@ -179,10 +179,6 @@ class TransportDelay(Block):
 
     def _delay_text(self) -> str:
         return f"{self.delay:g}" if isinstance(self.delay, float) else "…"
-
-
-def _exact(time: float) -> Fraction:
-    return read_time(time) or Fraction(repr(time))
 
 
 @lru_cache(maxsize=64)

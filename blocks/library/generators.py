@@ -11,7 +11,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from fractions import Fraction
 from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
@@ -28,6 +27,7 @@ from ..core import (
     Source,
     UnknownNameError,
     accepts,
+    exact_number,
     explain_disk_errors,
     kinds,
     move_earlier,
@@ -35,7 +35,6 @@ from ..core import (
     next_edge,
     parameter,
     period_of,
-    read_time,
     shorten,
 )
 from .piecewise_functions import piecewise
@@ -158,7 +157,7 @@ class PulseTrain(Source):
 
     def next_instant(self, t: float) -> float:
         """Return the next edge."""
-        period, delay, duty = (read_time(v) or Fraction(repr(v)) for v in (self.period, self.delay, self.duty))
+        period, delay, duty = map(exact_number, (self.period, self.delay, self.duty))
         return next_edge(t, self.period, self.delay, float(delay + duty * period))
 
     def changes(self) -> tuple[Array, Array]:
@@ -228,7 +227,7 @@ class Triangle(Source):
 
     def next_instant(self, t: float) -> float:
         """Return the next corner."""
-        period, delay, rise = (read_time(v) or Fraction(repr(v)) for v in (self.period, self.delay, self.rise))
+        period, delay, rise = map(exact_number, (self.period, self.delay, self.rise))
         return next_edge(t, self.period, self.delay, float(delay + rise * period))
 
     def output(self, t: Array, x: Any, u: Any) -> Array:

@@ -81,7 +81,7 @@ class _Limits:
         if getattr(u, "shape", ()):
             raise ShapeError(
                 f"found shape {u.shape}; expected a scalar in a continuous subsystem, where each limit is an event. "
-                "Index the signal and give each entry an integrator of its own.",
+                "Index the signal and give each entry its own integrator.",
                 port="u",
             )
         free = np.abs(held) < 0.5

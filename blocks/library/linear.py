@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core import Array, Block, Input, Kind, Output, ParameterError, State, parameter
 from .python_control import (
+    MADE_FOR,
     FixedSampleTime,
     block_name,
     check_names,
@@ -159,9 +160,7 @@ class DiscreteStateSpace(FixedSampleTime, _StateSpace):
         In a continuous subsystem, or with a sample time other than ``dt``, when the diagram is built.
     """
 
-    dt: float | None = parameter(
-        default=None, unit="s", above=0.0, structural=True, description="sample time that it is made for; None: any"
-    )
+    dt: float | None = MADE_FOR
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
         """Return the next state."""
@@ -299,9 +298,7 @@ class DiscreteTransferFunction(FixedSampleTime, _TransferFunction):
         In a continuous subsystem, or with a sample time other than ``dt``, when the diagram is built.
     """
 
-    dt: float | None = parameter(
-        default=None, unit="s", above=0.0, structural=True, description="sample time that it is made for; None: any"
-    )
+    dt: float | None = MADE_FOR
 
     def output(self, t: Array, x: Any, u: Any, T: Array) -> Array:
         """Return the output."""

@@ -128,7 +128,6 @@ class And(_Combined):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the product of the inputs' truths."""
-        check_shapes(**u._asdict())
         return self.fold(u._replace(**{k: truth(v) for k, v in u._asdict().items()}), lambda a, b: a * b)
 
 

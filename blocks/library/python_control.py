@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Block, ParameterError, SampleTimeError, kinds, shorten
+from ..core import Block, GuardError, ParameterError, SampleTimeError, kinds, parameter, shorten
 
 
 def check_system(cls: type[Block], system: Any, kind: str) -> dict[str, Any]:
@@ -83,18 +83,24 @@ def sample_time_of(block: Block) -> float | bool:
 
 def check_names(block: Any, **numbers: int) -> None:
     """Refuse a number of names that is not that of the signals."""
-    for parameter, n in numbers.items():
-        names = getattr(block, parameter)
+    for port, n in numbers.items():
+        names = getattr(block, port)
         if names is not None and not kinds.names.holds(names):
             raise ParameterError(
                 f"found {shorten(names)}; expected a name for each of the {n}. Give texts.",
-                port=parameter,
+                port=port,
             )
         if names is not None and len(names) != n:
             raise ParameterError(
                 f"found {len(names)} names ({', '.join(map(str, names))}); expected {n}. Give one for each.",
-                port=parameter,
+                port=port,
             )
+
+
+MADE_FOR: Any = parameter(
+    default=None, unit="s", above=0.0, structural=True, description="sample time that it is made for; None: any"
+)
+"""The parameter ``dt`` of blocks in discrete time."""
 
 
 class FixedSampleTime:
@@ -124,8 +130,6 @@ class FixedSampleTime:
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> Any:
         """Return the error of sample times that differ."""
-        from ..core import GuardError
-
         return GuardError(self._message(None), block=self.label, port="dt")
 
     def _message(self, T: float | None) -> str:

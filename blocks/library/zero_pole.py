@@ -10,6 +10,7 @@ import numpy as np
 from ..core import Array, Block, Input, Kind, Output, ParameterError, State, lay_out, parameter
 from .linear import Names, section
 from .python_control import (
+    MADE_FOR,
     FixedSampleTime,
     block_name,
     check_names,
@@ -238,9 +239,7 @@ class DiscreteZeroPoleGain(FixedSampleTime, _ZeroPoleGain):
         In a continuous subsystem, or with a sample time other than ``dt``, when the diagram is built.
     """
 
-    dt: float | None = parameter(
-        default=None, unit="s", above=0.0, structural=True, description="sample time that it is made for; None: any"
-    )
+    dt: float | None = MADE_FOR
 
     def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
         """Return output and next state of a section."""

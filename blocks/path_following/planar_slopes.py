@@ -28,10 +28,8 @@ MOST = 64
 
 
 def planar_slopes(model: PlanarModel, position: Array, velocity: Array) -> PlanarSlopes:
-    """Return G_v, ∂f_v/∂x_v and the derivatives by the position, by algorithmic differentiation.
-
-    Those of models of this package are kept: the equations of others may have changed since.
-    """
+    """Return G_v, ∂f_v/∂x_v and the derivatives by the position, by algorithmic differentiation."""
+    # those of models of this package are kept; the equations of others may have changed since
     ours = type(model).__module__.partition(".")[0] == __name__.partition(".")[0]
     key = identity(model), np.asarray(position, dtype=float).tobytes(), np.asarray(velocity, dtype=float).tobytes()
     found = _KNOWN.get(key) if ours else None

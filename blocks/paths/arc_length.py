@@ -27,10 +27,8 @@ def _fit_matrices() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def integrate(speed: Callable[[np.ndarray], np.ndarray], knots: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return breaks, coefficients (pieces, 1, powers) and total of the integral of ``speed`` from the first knot on.
-
-    Intervals are halved until the Chebyshev coefficients of the speed on each have decayed to rounding errors.
-    """
+    """Return breaks, coefficients (pieces, 1, powers) and total of the integral of ``speed`` from the first knot on."""
+    # intervals are halved until the Chebyshev coefficients of the speed on each have decayed to rounding errors
     nodes, analysis, integrals = _fit_matrices()
     start, width = np.asarray(knots[:-1], dtype=float), np.diff(knots)
     done: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []

@@ -464,12 +464,10 @@ def as_positions(path: Path, y: object) -> np.ndarray:
 
 
 def _find_nearest(path: Path, y: np.ndarray) -> float:
-    """Return the parameter of the point of the path nearest to y, among all of it.
-
-    Around every dip of the sampled distance that may be the least, three cells to both sides are resampled 16 times as
-    finely, twice, since two minima may share a cell near a cusp of the evolute. The dips left are polished by Newton
-    steps within their brackets, and the best is returned.
-    """
+    """Return the parameter of the point of the path nearest to y, among all of it."""
+    # Around every dip of the sampled distance that may be the least, three cells to both sides are resampled 16 times
+    # as finely, twice, since two minima may share a cell near a cusp of the evolute. The dips left are polished by
+    # Newton steps within their brackets, and the best is returned.
     if not np.all(np.isfinite(y)):
         return float("nan")
     theta, lengths = path.sampling
@@ -598,11 +596,9 @@ class _Contact:
 
 
 def _reach_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return breaks and coefficients (pieces, 2, 2) of the inverse reach, left and right, linear between the nodes.
-
-    The inverse reach is a maximum of smooth functions, so at its kinks straight lines lie above it, on the safe side.
-    Intervals are cut in three until the line is near enough at both thirds; then the slack is added everywhere.
-    """
+    """Return breaks and coefficients (pieces, 2, 2) of the inverse reach, left and right, linear between the nodes."""
+    # The inverse reach is a maximum of smooth functions, so at its kinks straight lines lie above it, on the safe side.
+    # Intervals are cut in three until the line is near enough at both thirds; then the slack is added everywhere.
     contact = _Contact(path)
     flat = 0.15 / path.length  # errors below it don't matter: the reach is then many times the path's size
     theta = _subdivide(path.knots)

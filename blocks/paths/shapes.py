@@ -60,11 +60,9 @@ class Ellipse(Path):
 
     @cached_property
     def _fourier(self) -> np.ndarray | None:
-        """Mean speed, then the coefficients of sin 2kθ in the arc length; None if there would be too many.
-
-        The speed has the period π; its Fourier coefficients fall like ((a − b)/(a + b))^k, so that the trapezoidal
-        rule (a DFT) gives them to rounding errors.
-        """
+        """Mean speed, then the coefficients of sin 2kθ in the arc length; None if there would be too many."""
+        # The speed has the period π; its Fourier coefficients fall like ((a − b)/(a + b))^k, so that the trapezoidal
+        # rule (a DFT) gives them to rounding errors.
         a, b = self.semi_axes
         n = 8 * _MOST_TERMS
         theta = np.pi / n * np.arange(n)
