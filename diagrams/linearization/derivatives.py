@@ -139,9 +139,7 @@ class LocalDerivatives:
         """Direction of the diagram's vector of parameters p, along which slopes are carried."""
         self.scale, self.error = 1.0, 0.0
         """Size of the parameter, and the largest estimated error of a slope that is made of differences."""
-        self._schedules: dict[frozenset[TickPattern], Schedule] = {}
-        self._derivatives: dict[frozenset[TickPattern], Derivative] = {}
-        self._closed_slopes: dict[frozenset[TickPattern], Derivative] = {}
+        self._made: dict[tuple[str, frozenset[TickPattern]], Any] = {}
         self._plants: dict[tuple[Any, ...], PlantModel] = {}
         taps = [tuple((tap.port, tap.entries) for tap in group) for group in (inputs, outputs, openings)]
         self._taps: tuple[Any, ...] = tuple(taps)
@@ -202,7 +200,9 @@ class LocalDerivatives:
 
         The slopes of stairs that are replaced depend on the operating point, their places don't.
         """
-        return self.flat.keep((name, acting, self._taps, self.stairs.places), make)
+        if (name, acting) not in self._made:
+            self._made[name, acting] = self.flat.keep((name, acting, self._taps, self.stairs.places), make)
+        return cast("T", self._made[name, acting])
 
     def _make_taps(self, d: ca.MX, c: ca.MX) -> dict[tuple[str, str], Any]:
         """Return a function for each port with an injection or a cut, from its signal to that of the consumers."""
@@ -255,19 +255,11 @@ class LocalDerivatives:
 
             return trace_schedule("closed", symbols, results)
 
-        if acting not in self._schedules:
-            self._schedules[acting] = self._kept("closed", acting, make)
-        return self._schedules[acting]
+        return self._kept("closed", acting, make)
 
     def _differentiate_closed(self, acting: frozenset[TickPattern]) -> Derivative:
         """Return the function of `_trace_closed` and its derivative by x."""
-
-        def make() -> Derivative:
-            return Derivative(self._trace_closed(acting), [("x", None)])
-
-        if acting not in self._closed_slopes:
-            self._closed_slopes[acting] = self._kept("closed slopes", acting, make)
-        return self._closed_slopes[acting]
+        return self._kept("closed slopes", acting, lambda: Derivative(self._trace_closed(acting), [("x", None)]))
 
     def _trace_parts(self, acting: frozenset[TickPattern], *, with_stairs: bool = False) -> Schedule:
         """Return the values at an instant by (t, x, w, p, d, e, c); with the stairs' own values where asked for."""
@@ -326,13 +318,8 @@ class LocalDerivatives:
 
     def _trace_derivative(self, acting: frozenset[TickPattern]) -> Derivative:
         """Return values and derivatives by (x, w, d) at an instant; ``NONE`` is one between ticks."""
-
-        def make() -> Derivative:
-            return Derivative(self._trace_parts(acting), [(name, None) for name in _ARGUMENTS])
-
-        if acting not in self._derivatives:
-            self._derivatives[acting] = self._kept("parts", acting, make)
-        return self._derivatives[acting]
+        by = [(name, None) for name in _ARGUMENTS]
+        return self._kept("parts", acting, lambda: Derivative(self._trace_parts(acting), by))
 
     def _solve_loops(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant."""

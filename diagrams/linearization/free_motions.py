@@ -39,7 +39,7 @@ from .exchanged import evaluators_at, noise_of
 from .flow_model import LinearDelays
 from .mean_stairs import replace_stairs
 from .over_a_period import find_needed, own_states
-from .plant_models import PlantModel, fmu_at, join_matrices, linearize_equations, plant_entries, point_inputs
+from .plant_models import PlantModel, fmu_at, join_matrices, linearize_equations, plant_entries, plant_point
 from .signal_paths import SignalPaths
 from .tick_chain import Chain, Visit, period_of
 
@@ -590,7 +590,7 @@ class _Look:
         u = np.zeros(inputs.total)
         u[wired] = vz
         sizes = [sign * unit * s for s in PLANT_SIZES for sign in (1.0, -1.0)]
-        now = {**plant.point.plants[plant.path], "inputs": point_inputs(self.flat, plant.point, plant.path, plant.z)}
+        now = plant_point(self.flat, plant.point, plant.path, plant.z)
         rounding = ROUNDING if is_built_here(block.description.digest) else SOLVED
         to_outputs = m.y_by_states @ plant.Vp + m.y_by_inputs @ plant.Vz
         follows = np.concatenate([vp, self._shift(to_outputs[plant.outputs], v)])

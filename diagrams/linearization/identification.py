@@ -60,7 +60,6 @@ class IdentifiedStep:
     C: np.ndarray
     y0: np.ndarray
     states: tuple[str, ...]
-    singular_values: np.ndarray
     derivation: Derivation
     uncertainty: float
 
@@ -86,7 +85,7 @@ def identify_step(
         found = _KNOWN.get(key)
     if found is None:
         found = _identify(block, point, h, outputs, samples)
-        for part in (found.A, found.B, found.C, found.y0, found.singular_values):
+        for part in (found.A, found.B, found.C, found.y0):
             part.setflags(write=False)
         with _LOCK:
             _KNOWN[key] = found
@@ -107,14 +106,11 @@ def _identify(
         G, noise = _measure_markov(runner, samples)
     finally:
         runner.close()
-    A, B, C, sigma = realize(G, noise)
+    A, B, C, _ = realize(G, noise)
     model = predict_markov(A, B, C, len(G))
     error = float(np.max(np.abs(model - G), initial=0.0) + np.max(noise, initial=0.0))
-    states, derivation = (
-        tuple(f"mode[{i + 1}]" for i in range(len(A))),
-        Derivation(DerivativeMethod.IDENTIFIED, order=len(A), restarted=runner.rest.lied),
-    )
-    return IdentifiedStep(A, B, C, y0, states, sigma, derivation, error)
+    derivation = Derivation(DerivativeMethod.IDENTIFIED, order=len(A), restarted=runner.rest.lied)
+    return IdentifiedStep(A, B, C, y0, tuple(f"mode[{i + 1}]" for i in range(len(A))), derivation, error)
 
 
 def _check_rest(y0: np.ndarray, outputs: np.ndarray, block: Fmu) -> None:

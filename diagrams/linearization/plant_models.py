@@ -142,7 +142,7 @@ def plant_changes(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray
         block = fmu_at(flat, path)
         if not block.description.states:
             continue
-        now = {**at.plants[path], "inputs": point_inputs(flat, at, path, at.z)}
+        now = plant_point(flat, at, path, at.z)
         try:
             m = linearize_fmu(block, **now)
             change = m.f
@@ -167,28 +167,27 @@ def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> l
             block=plant_paths(flat)[0],
             port="plants",
         )
-    models = []
-    for path in plant_paths(flat):
-        z, w, wired = plant_entries(flat, path)
-        m = linearize_equations(flat, at, path, at.z)
-        B, D, names = m.B[:, wired], m.D[:, wired], _prefix_names(path, m.states)
-        models.append(
-            PlantModel(
-                path=path,
-                A=m.A,
-                B=B,
-                C=m.C,
-                D=D,
-                x0=m.x0,
-                f=m.f,
-                states=names,
-                inputs=z,
-                outputs=w,
-                derivation=m.derivation,
-                uncertainty=_largest_error(m),
-            )
-        )
-    return models
+    return [_plant_model(flat, path, linearize_equations(flat, at, path, at.z)) for path in plant_paths(flat)]
+
+
+def _plant_model(flat: FlatDiagram, path: str, m: FmuLinearization, **more: Any) -> PlantModel:
+    """Return a linear model of an FMU by its entries in z and w, of those inputs alone that are wired."""
+    z, w, wired = plant_entries(flat, path)
+    return PlantModel(
+        path=path,
+        A=m.A,
+        B=m.B[:, wired],
+        C=m.C,
+        D=m.D[:, wired],
+        x0=m.x0,
+        f=m.f,
+        states=_prefix_names(path, m.states),
+        inputs=z,
+        outputs=w,
+        derivation=m.derivation,
+        uncertainty=_largest_error(m),
+        **more,
+    )
 
 
 def check_way(way: str | None) -> None:
@@ -209,25 +208,21 @@ def model_step(
     step itself; "identified" takes pulse responses from rest. None takes the first at an equilibrium, else the second;
     where the FMU does not allow that, the first with its error, or the third.
     """
-    mine, w, wired = plant_entries(flat, path)
-    block = fmu_at(flat, path)
-    m: FmuLinearization | _HeldStep
+    block, now = fmu_at(flat, path), plant_point(flat, at, path, z)
     equations: FmuLinearization | None
     try:
-        equations = linearize_equations(flat, at, path, z)
+        equations = linearize_fmu(block, **now)
     except FmuError:
         if way == "equations":
             raise
         equations = None
     rests = equations is not None and (way == "equations" or (way is None and _is_at_rest(equations)))
-    held = _hold_at_rest(flat, at, path, z, h, way, equations) if equations is not None and rests else None
-    if equations is not None and held is not None:
-        m, derivation, C, D = held, replace(equations.derivation, held=True), equations.C, equations.D
-    elif way == "identified" or not block.description.states:  # the FMU may have states that it doesn't show
-        return _identify_model(flat, at, path, z, h)
-    else:
+    m = _hold_at_rest(block, now, h, way, equations) if equations is not None and rests else None
+    after = None
+    if m is None:
+        if way == "identified" or not block.description.states:  # the FMU may have states that it doesn't show
+            return _identify_model(flat, at, path, z, h)
         try:
-            now = {**at.plants[path], "inputs": point_inputs(flat, at, path, z)}
             step = linearize_fmu(block, h=h, **now)
         except FmuError as error:
             if way == "step":
@@ -237,58 +232,34 @@ def model_step(
                     return _identify_model(flat, at, path, z, h)
                 except FmuError as last:
                     raise last from error
-            m = _hold_in_motion(flat, at, path, z, h, equations)
-            derivation, C, D = replace(equations.derivation, held=True), equations.C, equations.D
+            m = _hold_in_motion(block, now, h, equations)
         else:
-            m, derivation = step, step.derivation
             C, D = _outputs_before(flat, at, path, equations, step, z)
-    names = _prefix_names(path, m.states)
-    after = (m.C, m.D[:, wired]) if isinstance(m, FmuLinearization) else None
-    following = {
-        "t": at.plants[path]["t"] + h,
-        "state": _states_after(block, at, path, m.f),
-        "inputs": point_inputs(flat, at, path, z),
-    }
-    return PlantModel(
-        path=path,
-        A=m.A,
-        B=m.B[:, wired],
-        C=C,
-        D=D[:, wired],
-        x0=m.x0,
-        f=m.f,
-        states=names,
-        inputs=mine,
-        outputs=w,
-        derivation=derivation,
-        uncertainty=_largest_error(m),
-        y_next=m.y0,
-        next=following,
-        after=after,
-    )
+            # the step's own derivatives are those of the outputs after it, by the states before it
+            m, after = replace(step, C=C, D=D), (step.C, step.D[:, plant_entries(flat, path)[2]])
+    following = {**now, "t": now["t"] + h, "state": _states_after(block, now, m.f)}
+    return _plant_model(flat, path, m, y_next=m.y0, next=following, after=after)
 
 
 def _identify_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float) -> PlantModel:
     mine, w, wired = plant_entries(flat, path)
-    now = {**at.plants[path], "inputs": point_inputs(flat, at, path, z)}
+    now = plant_point(flat, at, path, z)
     m = identify_step(fmu_at(flat, path), now, h, at.w[w])
-    n, rest, names = len(m.A), {**now, "t": now["t"] + h}, _prefix_names(path, m.states)
-    D = np.zeros((len(w), len(wired)))
     return PlantModel(
         path=path,
         A=m.A,
         B=m.B[:, wired],
         C=m.C,
-        D=D,
-        x0=np.zeros(n),
-        f=np.zeros(n),
-        states=names,
+        D=np.zeros((len(w), len(wired))),
+        x0=np.zeros(len(m.A)),
+        f=np.zeros(len(m.A)),
+        states=_prefix_names(path, m.states),
         inputs=mine,
         outputs=w,
         derivation=m.derivation,
         uncertainty=m.uncertainty,
         y_next=m.y0,
-        next=rest,
+        next={**now, "t": now["t"] + h},
         identified=True,
     )
 
@@ -297,40 +268,38 @@ def _is_at_rest(m: FmuLinearization) -> bool:
     return bool(np.max(np.abs(m.f) / (1.0 + np.abs(m.x0)), initial=0.0) <= EQUILIBRIUM)
 
 
-@dataclass(frozen=True, eq=False)
-class _HeldStep:
-    """A model of a step, from the model of the equations."""
+def _hold_inputs(m: FmuLinearization, h: float) -> FmuLinearization:
+    """Return the model of a step with held inputs; the rates f at the point act like a further input.
 
-    A: np.ndarray
-    B: np.ndarray
-    x0: np.ndarray
-    f: np.ndarray
-    y0: np.ndarray
-    states: tuple[str, ...]
-    uncertainty: np.ndarray
-
-
-def _hold_inputs(m: FmuLinearization, h: float) -> _HeldStep:
-    """Return the model of a step with held inputs; the rates f at the point act like a further input."""
+    C and D stay those at the beginning of the step, y0 are the outputs after it.
+    """
     A, forced = hold_inputs(m.A, np.hstack([m.B, m.f[:, None]]), h)
     change = forced[:, -1]
-    return _HeldStep(A, forced[:, :-1], m.x0, m.x0 + change, m.y0 + m.C @ change, m.states, m.uncertainty * h)
+    return replace(
+        m,
+        A=A,
+        B=forced[:, :-1],
+        h=h,
+        f=m.x0 + change,
+        y0=m.y0 + m.C @ change,
+        derivation=replace(m.derivation, held=True),
+        uncertainty=m.uncertainty * h,
+    )
 
 
 def _hold_at_rest(
-    flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None, m: FmuLinearization
-) -> _HeldStep | None:
+    block: Fmu, now: Mapping[str, Any], h: float, way: str | None, m: FmuLinearization
+) -> FmuLinearization | None:
     """Return the model of a step from the equations, with its distance to the FMU's own step.
 
     None where that step is another model: an FMU's own solver may be coarse, and a step of Euler's method is no matrix
     exponential.
     """
-    held, block = _hold_inputs(m, h), fmu_at(flat, path)
+    held = _hold_inputs(m, h)
     if way is not None or is_built_here(block.description.digest):
         return held
-    point = {**at.plants[path], "inputs": point_inputs(flat, at, path, z)}
     try:
-        gap, error = step_gap(block, h=h, A=held.A, B=held.B, **point)
+        gap, error = step_gap(block, h=h, A=held.A, B=held.B, **now)
     except FmuError:
         return held
     if gap <= 3.0 * error + SOLVED:
@@ -343,20 +312,15 @@ def _hold_at_rest(
     )
 
 
-def _hold_in_motion(
-    flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float, m: FmuLinearization
-) -> _HeldStep:
+def _hold_in_motion(block: Fmu, now: Mapping[str, Any], h: float, m: FmuLinearization) -> FmuLinearization:
     """Return the model of a step with held inputs from the equations, at a point that moves.
 
     The distance to such a model from the equations at the end of the step is its uncertainty.
     """
     held = _hold_inputs(m, h)
-    after = _states_after(fmu_at(flat, path), at, path, held.f)
-    point = {**at.plants[path], "t": at.plants[path]["t"] + h, "state": after}
-    later = linearize_equations(flat, replace(at, plants={**at.plants, path: point}), path, z)
+    later = linearize_fmu(block, **{**now, "t": now["t"] + h, "state": _states_after(block, now, held.f)})
     end = _hold_inputs(later, h)
-    parts = ((held.A, end.A), (held.B, end.B), (m.C, later.C), (m.D, later.D))
-    apart = max(float(np.max(np.abs(a - b), initial=0.0)) for a, b in parts)
+    apart = max(float(np.max(np.abs(getattr(held, M) - getattr(end, M)), initial=0.0)) for M in "ABCD")
     return replace(held, uncertainty=held.uncertainty + apart)
 
 
@@ -382,31 +346,30 @@ def _outputs_before(
 
 def linearize_equations(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> FmuLinearization:
     """Return the linear model of an FMU's equations under the inputs z."""
-    point = at.plants[path]
-    return linearize_fmu(fmu_at(flat, path), t=point["t"], state=point["state"], inputs=point_inputs(flat, at, path, z))
+    return linearize_fmu(fmu_at(flat, path), **plant_point(flat, at, path, z))
 
 
-def point_inputs(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> dict[str, Any]:
-    """Return an FMU's inputs by port: wired ones from z, the others from the operating point."""
+def plant_point(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> dict[str, Any]:
+    """Return time, states and inputs of an FMU at a point: wired inputs from z, the others from the point."""
     given = dict(at.plants[path]["inputs"])
     for port in flat.table.blocks[path].inputs:
         where = flat.plant_inputs.slices.get(join(path, port))
         if where is not None:
             given[port] = z[where].reshape(np.shape(given[port]))
-    return given
+    return {**at.plants[path], "inputs": given}
 
 
-def _states_after(block: Fmu, at: OperatingPoint, path: str, f: np.ndarray) -> dict[str, Any]:
+def _states_after(block: Fmu, now: Mapping[str, Any], f: np.ndarray) -> dict[str, Any]:
     """Return an FMU's states after a step; discrete states stay as they are."""
-    continuous = plant_layout({path: block}, {path: at.plants[path]}).of_block[path].split(f)
-    return {**at.plants[path]["state"], **continuous}
+    continuous = plant_layout({"": block}, {"": now}).of_block[""].split(f)
+    return {**now["state"], **continuous}
 
 
 def _prefix_names(path: str, states: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{path}.{name}" for name in states)
 
 
-def _largest_error(m: FmuLinearization | _HeldStep) -> float:
+def _largest_error(m: FmuLinearization) -> float:
     """Return the largest error that is known; entries with a NaN have none."""
     return float(np.max(m.uncertainty, initial=0.0, where=np.isfinite(m.uncertainty)))
 
