@@ -60,7 +60,7 @@ class TrialMethod(Enum):
 
 
 class TriedContact(Protocol):
-    """A contact, as its limits are tried."""
+    """A contact, as its limits are tried; a protocol, as `Contact` itself is above this file and calls it."""
 
     @property
     def wired(self) -> WiredDiagram:

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from ...blocks.core import OptionError, UnknownNameError, near, same_unit
-from ..linearization import Tap, find_signal
+from ..linearization import Tap, find_signal, wire_entries
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
+    from ..wiring import Wire
 
 
 class PortNames(NamedTuple):
@@ -84,14 +83,6 @@ class Ports:
         return cls(plant, port, *found)
 
 
-class DrivingPort(NamedTuple):
-    """Output port, or a part of it, that an input of the plant is wired to."""
-
-    block: str
-    port: str
-    part: int | slice | None
-
-
 def check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Tap) -> None:
     """Refuse a measured force in another unit than the force itself, where both are known."""
     force, measured = diagram.blocks[path].inputs[ports.force].unit, diagram.checked.units.get(signal.port)
@@ -104,16 +95,12 @@ def check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Tap) -> N
         )
 
 
-def check_command(flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[str, DrivingPort]) -> None:
+def check_command(flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[str, Wire]) -> None:
     """Refuse a measured force that is a command of the plant: it drives another of its inputs."""
     for port, source in wires.items():
-        if port == ports.force:
+        if port == ports.force or (source.block, source.port) != signal.port:
             continue
-        if (source.block, source.port) != signal.port:
-            continue
-        shape = flat.checked.shapes[signal.port]
-        every = np.arange(int(np.prod(shape))).reshape(shape)
-        if set(np.ravel(every if source.part is None else every[source.part]).tolist()) & set(signal.entries):
+        if set(wire_entries(flat, source)) & set(signal.entries):
             raise OptionError(
                 f"found {signal.name!r}, which drives {ports.plant}.{port}; expected the signal of the force sensor, "
                 "which acts on the controller alone. Name that wire: force=….",

@@ -12,6 +12,7 @@ from all signals of the plant to all its inputs.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -39,13 +40,15 @@ from ..linearization import (
     linearize_plant,
     model_ticks,
     moves_between_ticks,
+    wire_entries,
 )
-from .contact_ports import DrivingPort, Ports, check_command, check_unit, force_wire_error
+from .contact_ports import Ports, check_command, check_unit, force_wire_error
 from .measured_force import Tool, find_entry, find_tool
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
     from ..results import OperatingPoint
+    from ..wiring import Wire
 
 
 class StateMatrices(NamedTuple):
@@ -242,10 +245,10 @@ def take_apart(
     return parts, any(isinstance(f, UnusualStart) for f in model.findings)
 
 
-def _find_sources(flat: FlatDiagram, path: str) -> dict[str, DrivingPort]:
+def _find_sources(flat: FlatDiagram, path: str) -> dict[str, Wire]:
     """Return the sources of a plant's inputs, by input; wires go through the delays of subsystems."""
     found = {
-        port: DrivingPort(wire.block, wire.port, wire.index)
+        port: wire
         for port in flat.table.blocks[path].inputs
         if (wire := flat.table.wires.get((path, port))) is not None
     }
@@ -289,7 +292,7 @@ def _cut_controller(
     matrices: FourMatrices,
     states: Sequence[str],
     path: str,
-    wires: Mapping[str, DrivingPort],
+    wires: Mapping[str, Wire],
     flat: FlatDiagram,
     signal: Tap | None,
 ) -> StateMatrices:
@@ -297,16 +300,10 @@ def _cut_controller(
     A, B, C, D = matrices
     own = [_is_of(path, name) for name in states]
     keep = [i for i, mine in enumerate(own) if not mine]
-    rows, start, shapes = dict[tuple[str, str], np.ndarray](), 0, flat.checked.shapes
-    for block, port in dict.fromkeys((wire.block, wire.port) for wire in wires.values()):
-        many = int(np.prod(shapes[block, port]))
-        rows[block, port] = np.arange(start, start + many).reshape(shapes[block, port])
-        start += many
-    picked = [
-        i
-        for wire in wires.values()
-        for i in np.ravel(rows[wire.block, wire.port][... if wire.part is None else wire.part]).tolist()
-    ]
+    first, total = dict[tuple[str, str], int](), 0  # rows of the model: all entries of each source
+    for source in dict.fromkeys((wire.block, wire.port) for wire in wires.values()):
+        first[source], total = total, total + math.prod(flat.checked.shapes[source])
+    picked = [first[wire.block, wire.port] + e for wire in wires.values() for e in wire_entries(flat, wire)]
     hidden = [i for i, mine in enumerate(own) if mine]
     if np.any(A[np.ix_(keep, hidden)]) or np.any(C[np.ix_(picked, hidden)]):
         raise OptionError(
@@ -315,8 +312,8 @@ def _cut_controller(
             block=path,
         )
     D = D[picked].copy()
-    if signal is not None and signal.port in rows:  # it is measured ahead of what is injected there
-        taken = np.ravel(rows[signal.port])[list(signal.entries)].tolist()
+    if signal is not None and signal.port in first:  # it is measured ahead of what is injected there
+        taken = [first[signal.port] + e for e in signal.entries]
         for j, entry in enumerate(taken, D.shape[1] - len(taken)):
             D[[i for i, one in enumerate(picked) if one == entry], j] += 1.0
     return StateMatrices(A[np.ix_(keep, keep)], B[keep], C[np.ix_(picked, keep)], D)

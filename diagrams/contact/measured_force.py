@@ -26,11 +26,12 @@ import numpy as np
 from ...blocks import ForceSensor
 from ...blocks.core import OptionError
 from ..linearization import Linearization, PlantEquations, Tap, find_signal, linearize
-from .contact_ports import DrivingPort, Ports
+from .contact_ports import Ports
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
     from ..results import OperatingPoint
+    from ..wiring import Wire
 
 
 SAME = 1e-9
@@ -42,7 +43,7 @@ def find_entry(
     point: OperatingPoint,
     ports: Ports,
     signal: Tap,
-    wires: Mapping[str, DrivingPort],
+    wires: Mapping[str, Wire],
     opened: Sequence[str],
     options: Mapping[str, Any],
 ) -> Tap:
@@ -50,7 +51,7 @@ def find_entry(
     flat, source = diagram.flatten_like(point), wires.get(ports.force)
     if source is not None and (source.block, source.port) == signal.port:
         return find_signal(flat, signal.name)  # measured ahead of what is added: the plant has that already
-    if source is not None and source.part is None:
+    if source is not None and source.index is None:
         port = (source.block, source.port)
         sensor = flat.table.blocks[signal.port[0]]
         wire = flat.table.wires.get((signal.port[0], "force"))

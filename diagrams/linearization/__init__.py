@@ -1,11 +1,10 @@
 """Linear models, operating points and trim."""
 
 from .block_slopes import linearize_block
-from .cut_wires import carry_point, cut_to, name_of_cut
-from .derivatives import Tap, find_signal, moves_between_ticks
+from .derivatives import Tap, find_signal, moves_between_ticks, wire_entries
 from .flow_model import LinearDelays
 from .free_motions import FreeMotion, FreeMotions
-from .inserted_blocks import find_inputs, name_wire_to, with_passed_values
+from .inserted_blocks import carry_point, cut_to, find_inputs, name_of_cut, name_wire_to, with_passed_values
 from .kinks import find_kinks_between
 from .left_out_effects import (
     ApproximateDelay,
@@ -108,5 +107,6 @@ __all__ = [
     "ticks_between_renewals",
     "ticks_to_renewal",
     "trim",
+    "wire_entries",
     "with_passed_values",
 ]

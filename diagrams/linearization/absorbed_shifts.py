@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..flat import FlatDiagram
-from ..wiring import Wire
+from ..wiring import join
 from .block_slopes import BlockSlopes, slopes_of
-from .derivatives import Tap
+from .derivatives import Tap, wire_entries
 
 POINTS = 24
 """Points at which the equations of a block are evaluated."""
@@ -45,7 +45,11 @@ class ShiftedBlock:
             return None
         slopes = slopes_of(trace)
         wires = {name: wire for name in trace.inputs if (wire := flat.table.wires.get((path, name))) is not None}
-        return cls(path, slopes, tuple(watched), {name: _tap(flat, wire) for name, wire in wires.items()})
+        taps = {
+            name: Tap(join(wire.block, wire.port), (wire.block, wire.port), wire_entries(flat, wire), ())
+            for name, wire in wires.items()
+        }
+        return cls(path, slopes, tuple(watched), taps)
 
     def absorbs(self, flat: FlatDiagram, t: float, states: np.ndarray, inputs: Mapping[str, np.ndarray]) -> bool:
         """Return whether the answer to a shift is the same at every point, and in proportion to the shift.
@@ -86,11 +90,3 @@ class ShiftedBlock:
         for name, parameter in block.quanta.items():
             found[self.slopes.columns.slices[f"u {name}"]] = np.ravel(getattr(block, parameter))
         return np.where(d != 0.0, found, 0.0)
-
-
-def _tap(flat: FlatDiagram, wire: Wire) -> Tap:
-    """Return the signal that a wire takes."""
-    shape = flat.checked.shapes[wire.block, wire.port]
-    whole = np.arange(int(np.prod(shape, dtype=int))).reshape(shape)
-    part = whole if wire.index is None else np.asarray(whole[wire.index])
-    return Tap(f"{wire.block}.{wire.port}", (wire.block, wire.port), tuple(np.ravel(part).tolist()), ())

@@ -71,6 +71,13 @@ class Tap:
     entry: tuple[int, ...] = ()  # numbers of the entry that the name asks for, counted from 1; () for the whole
 
 
+def wire_entries(flat: FlatDiagram, wire: Wire) -> tuple[int, ...]:
+    """Return the numbers of the entries of a port that a wire takes."""
+    shape = flat.checked.shapes[wire.block, wire.port]
+    every = np.arange(size(shape)).reshape(shape)
+    return tuple(np.ravel(every if wire.index is None else every[wire.index]).tolist())
+
+
 def find_signal(flat: FlatDiagram, name: str) -> Tap:
     """Return the port, or entries of one, that a name of a wire or port denotes."""
     wires, ports = flat.table.names, flat.log.slices

@@ -26,15 +26,14 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuError, Layout, LoopwrightError, enumerate_some, explain_calls
-from ...blocks.tracing import size
 from ...fmus.platform import is_built_here
 from ...fmus.running import take_shifted_steps
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint
-from ..wiring import join
+from ..wiring import Wire, join
 from .absorbed_shifts import ShiftedBlock
 from .delay_channels import delay_channels
-from .derivatives import LocalDerivatives, Numbers, Tap, find_signal
+from .derivatives import LocalDerivatives, Numbers, Tap, find_signal, wire_entries
 from .exchanged import evaluators_at, noise_of
 from .flow_model import LinearDelays
 from .mean_stairs import replace_stairs
@@ -328,7 +327,11 @@ def _watched(flat: FlatDiagram, model: ClosedModel, required: Iterable[str]) -> 
     absorb a shift are left out; these blocks are the second result.
     """
     cut = [find_signal(flat, wire).port for wire in model.openings]
-    table, found = flat.table, dict[Port, set[int]]()
+    table, found = flat.table, dict[tuple[str, str], set[int]]()
+
+    def add(wire: Wire) -> None:
+        found.setdefault((wire.block, wire.port), set()).update(wire_entries(flat, wire))
+
     on_loops = SignalPaths(flat, cut).wires_on_loops()
     read: dict[str, list[str]] = {}
     for _, reader in on_loops:
@@ -337,25 +340,14 @@ def _watched(flat: FlatDiagram, model: ClosedModel, required: Iterable[str]) -> 
     blocks = {path: block for path, ports in read.items() if (block := ShiftedBlock.of(flat, path, ports)) is not None}
     for source, reader in on_loops:
         if reader.is_output or reader.block not in blocks:
-            wire = table.wires.get((reader.block, reader.port))
-            index = None if reader.is_output or wire is None else wire.index
-            _add_entries(flat, found, (source.block, source.port), index)
+            read_by = None if reader.is_output else table.wires.get((reader.block, reader.port))
+            add(Wire(source.block, source.port, None if read_by is None else read_by.index))
     for (path, _), wire in table.wires.items():
         reading = table.blocks[path]
         if hasattr(reading, "guards") or reading.stops:
-            _add_entries(flat, found, (wire.block, wire.port), wire.index)
+            add(wire)
     taps = [Tap(join(*port), port, tuple(sorted(entries)), ()) for port, entries in sorted(found.items())]
     return [*taps, *(find_signal(flat, name) for name in dict.fromkeys(required))], list(blocks.values())
-
-
-Port = tuple[str, str]
-
-
-def _add_entries(flat: FlatDiagram, found: dict[Port, set[int]], port: Port, index: Any) -> None:
-    """Add the entries of a port that a wire takes; all without an index."""
-    shape = flat.checked.shapes[port]
-    whole = np.arange(size(shape)).reshape(shape)
-    found.setdefault(port, set()).update(np.ravel(whole if index is None else whole[index]).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,7 +435,7 @@ class _Look:
         flat, at = model.wired.flatten_like(model.point), model.point
         watched, blocks = _watched(flat, model, required)
         cut, inputs = [find_signal(flat, wire) for wire in model.openings], [t for b in blocks for t in b.taps.values()]
-        means = replace_stairs(model.wired, flat, at, model.stairs)
+        means = replace_stairs(flat, at, model.stairs)
         local = LocalDerivatives(flat, (), [*watched, *inputs], cut, evaluators_at(flat, at), means)
         make = _look_at_period if model.dt else _look_at_flow
         instants, plants = make(model, flat, local, kept, np.arange(_count(watched)))

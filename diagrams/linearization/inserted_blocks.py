@@ -38,13 +38,16 @@ from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, layout_of
 from ..wiring import Structure, Wire, join
 from .block_slopes import slopes_of
-from .derivatives import find_signal
+from .derivatives import find_signal, wire_entries
 from .kinks import read_arguments, read_log
 from .left_out_effects import BlockFinding, CutFromTracking, InertConsumer
+from .operating_points import PointLike, copy_point
 from .shared_wires import find_shared_cuts
 from .signal_paths import PathNode, SignalPaths
 
 Port = tuple[str, str]
+STEP = 1e-3
+"""Communication step in s with which signals of a diagram without a clock are looked up."""
 
 
 class Passage(Block):
@@ -79,10 +82,8 @@ def split_inputs(
         else:
             continue
         wire = diagram.structure.wires[port]
-        signal = find_signal(flat, join(wire.block, wire.port))
-        entries = np.array(signal.entries).reshape(flat.checked.shapes[signal.port])
-        part = tuple(np.ravel(entries if wire.index is None else entries[wire.index]).tolist())
-        diagram, point, found[name] = insert_ahead(diagram, flat, point, [port], signal.port, part)
+        source, part = (wire.block, wire.port), wire_entries(flat, wire)
+        diagram, point, found[name] = insert_ahead(diagram, flat, point, [port], source, part)
     return diagram, point, found
 
 
@@ -208,10 +209,7 @@ def find_inputs(diagram: WiredDiagram, flat: FlatDiagram, wire: str, to: Iterabl
     inputs = [_find_input(diagram, name, fed) for name in to]
     for block, port in inputs:
         source = table.wires[block, port]
-        found = find_signal(flat, f"{source.block}.{source.port}")
-        entries = np.array(found.entries).reshape(flat.checked.shapes[found.port])
-        part = tuple(np.ravel(entries if source.index is None else entries[source.index]).tolist())
-        if found.port != signal.port or part != signal.entries:
+        if (source.block, source.port) != signal.port or wire_entries(flat, source) != signal.entries:
             raise WiringError(
                 f"found {source} wired to it; expected {wire!r}. Name the wire that feeds this input, or one of "
                 f"its consumers: {', '.join(join(*c) for c in _consumers(table.wires, signal.port)) or 'it has none'}.",
@@ -304,3 +302,26 @@ def _name_of(flat: FlatDiagram, port: Port) -> str:
     """Return the name of the wire behind a port, its path without one."""
     names = [n for n, w in flat.table.names.items() if (w.block, w.port) == port and w.index is None]
     return min(names, key=len, default=join(*port))
+
+
+# --- wires that are cut by a name ------------------------------------------------------------------------------------
+
+
+def name_of_cut(wire: str, inputs: Sequence[tuple[str, str]]) -> str:
+    """Return the name of a wire ahead of some of its consumers: "u → plant.u"."""
+    return f"{wire} → {', '.join(join(*to) for to in inputs)}" if inputs else wire
+
+
+def cut_to(diagram: WiredDiagram, wire: str, to: str | Iterable[str]) -> tuple[WiredDiagram, str]:
+    """Return the diagram in which a wire has a name ahead of some of its consumers, and that name."""
+    flat = diagram.flatten(None if diagram.has_clock else STEP)
+    inputs = find_inputs(diagram, flat, wire, [to] if isinstance(to, str) else to)
+    name = name_of_cut(wire, inputs)
+    return name_wire_to(diagram, name, inputs), name
+
+
+def carry_point(diagram: WiredDiagram, point: PointLike, cut: WiredDiagram) -> PointLike:
+    """Return an operating point of a diagram as one of the diagram in which wires are cut; other points as they are."""
+    if not isinstance(point, OperatingPoint) or cut is diagram:
+        return point
+    return with_passed_values(cut, copy_point(diagram, with_passed_values(diagram, point), cut))

@@ -7,9 +7,10 @@ least common period. Hold and delay are exact (`over_a_period`).
 
 from __future__ import annotations
 
+import cmath
 import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cached_property
@@ -45,6 +46,7 @@ from ..frequency import (
     delayed_system_class,
     loop_class,
     mu_bound,
+    order_key,
     plot_poles,
 )
 from ..results import OperatingPoint
@@ -57,11 +59,10 @@ from .free_motions import ClosedModel, FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .left_out_effects import EntryTaken
-from .mean_stairs import replace_stairs
+from .mean_stairs import A_TREATMENT, replace_stairs
 from .operating_points import PointLike, check_options, operating_point, refine_ticks
 from .over_a_period import begin_loop, confirm_loop, model_loop, model_period
-from .plant_models import EQUILIBRIUM
-from .pole_table import pole_rows
+from .plant_models import A_WAY, EQUILIBRIUM
 from .signal_paths import SignalPaths
 from .tick_chain import period_of
 
@@ -85,6 +86,8 @@ WAYS = {
     **dict.fromkeys(("ss", "state_space", "to_ss", "tf"), "lin.system, or lin.A, lin.B, lin.C, lin.D"),
 }
 """What to write for names that users of other tools look for in a linear model."""
+REAL = 1e-4
+"""Imaginary part, relative to the pole, below which it is shown as real. Of a multiple pole it is rounding alone."""
 MOST_SHOWN, MOST_NAMES = 60, 8
 """States up to which a model's table has the poles (a few milliseconds), and names that it shows in a row."""
 
@@ -180,7 +183,7 @@ class Linearization(ShownAsTable):
             notes.append(f"It has {len(self.states)} states: model.poles.")
         else:
             columns = "pole", "frequency in rad/s", "damping", *(("size",) if T else ())
-            grids.append(Grid(f"Poles in the {'z' if T else 's'} plane", columns, tuple(pole_rows(self.poles, T))))
+            grids.append(Grid(f"Poles in the {'z' if T else 's'} plane", columns, tuple(_pole_rows(self.poles, T))))
         moves = "" if math.isnan(point.residual) else f", residual {point.residual:.3g}"
         return Sheet(
             f"linear model of {self.wired.name!r}",
@@ -437,8 +440,8 @@ class Linearization(ShownAsTable):
         """
         made: LoopTransfer
         if to:
-            diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
-            made = replace(self, wired=diagram, point=point).loop(port, lifted=lifted, slow=slow)
+            model, port = self._ahead_of(wires, to)
+            made = model.loop(*port, lifted=lifted, slow=slow)
             name = f"L({', '.join(wires)} to {', '.join(_as_list(to))})"
             made.name = name.replace(".", "_")  # python-control refuses dots in names
             return made
@@ -456,19 +459,22 @@ class Linearization(ShownAsTable):
         whole period. S of a wire that is renewed several times in the period is not 1/(1 + L): there is no L at one
         rate.
         """
-        if to:
-            diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
-            return replace(self, wired=diagram, point=point).sensitivity(port)
-        closed = self._make_at(wires)
+        model, wires = self._ahead_of(wires, to)
+        closed = model._make_at(wires)
         return closed._state_space(closed.C, closed.D + np.eye(len(closed.D)), f"S({', '.join(wires)})")
 
     def complementary(self, *wires: str, to: str | Iterable[str] = ()) -> StateSpace:
         """Return T = 1 − S at a wire; with ``to`` ahead of these consumers, as `sensitivity`."""
-        if to:
-            diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
-            return replace(self, wired=diagram, point=point).complementary(port)
-        closed = self._make_at(wires)
+        model, wires = self._ahead_of(wires, to)
+        closed = model._make_at(wires)
         return closed._state_space(-closed.C, -closed.D, f"T({', '.join(wires)})", sign=-1.0)
+
+    def _ahead_of(self, wires: tuple[str, ...], to: str | Iterable[str]) -> tuple[Linearization, tuple[str, ...]]:
+        """Return the model of the diagram with a block ahead of some consumers of a wire, and that block's port."""
+        if not to:
+            return self, wires
+        diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
+        return replace(self, wired=diagram, point=point), (port,)
 
     def _make_at(
         self, wires: tuple[str, ...], openings: tuple[str, ...] = (), loop: str = "", slow: str = "closed"
@@ -496,6 +502,18 @@ class Linearization(ShownAsTable):
         return made
 
 
+def _pole_rows(poles: Iterable[complex], T: float) -> Iterator[tuple[object, ...]]:
+    """Yield a row of a table for each real pole and each pair, with frequency and damping in continuous time."""
+    found = [complex(p) for p in poles]
+    found = [p if abs(p.imag) > REAL * abs(p) else complex(p.real, 0.0) for p in found if p.imag >= -REAL * abs(p)]
+    for p in sorted(found, key=lambda p: (-order_key(abs(p)), order_key(p.real))):
+        s = p if not T else cmath.log(p) / T if p else None
+        turns = s is not None and abs(s) > 0.0 and math.isfinite(abs(s))
+        text = f"{p.real + 0.0:.4g} ± {p.imag:.4g}j" if p.imag else f"{p.real + 0.0:.4g}"
+        speed = () if s is None or not turns else (float(f"{abs(s):.4g}"), float(f"{-s.real / abs(s) + 0.0:.4g}"))
+        yield text, *(speed or (None, None)), *((float(f"{abs(p):.6g}"),) if T else ())
+
+
 def _sorted_poles(A: np.ndarray) -> np.ndarray:
     """Return the eigenvalues of a matrix, the largest first."""
     poles = np.linalg.eigvals(A) if A.size else np.zeros(0)
@@ -519,6 +537,9 @@ def linearize(
     """Linearize a diagram; see `Diagram.linearize`."""
     check_argument(delays, kinds.choice("exact", "pade"), "delays", "linearize")
     check_argument(order, kinds.integer(1), "order", "linearize")
+    for name, given, kind in (("plants", plants, A_WAY), ("stairs", stairs, A_TREATMENT)):
+        if given is not None:
+            check_argument(given, kind, name, diagram.name)
     check_options(options, "linearize")
     at = operating_point(diagram, point, options)
     if delays == "pade" and _is_discrete(diagram, options.get("step")):
@@ -624,7 +645,7 @@ def _linearize(
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
         _check_opening(flat, signal)
-    means = replace_stairs(diagram, flat, at, stairs)
+    means = replace_stairs(flat, at, stairs)
     channels = list[str]()
     local = LocalDerivatives(flat, found[0], found[1], found[2], evaluators_at(flat, at), means)
     # a sampled diagram's model is the map over a period, a continuous one's the derivatives at the instant

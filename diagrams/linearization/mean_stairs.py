@@ -17,9 +17,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Finding, Layout, OptionError
+from ...blocks.core import Finding, Layout, kinds
 from ...blocks.tracing import NEXT
-from ..flat import FlatDiagram, Instant, WiredDiagram
+from ..flat import FlatDiagram, Instant
 from ..results import OperatingPoint
 from .block_slopes import BlockSlopes, slopes_of
 from .kinks import read_arguments
@@ -179,23 +179,20 @@ def _means(f: Any, arguments: Sequence[Any]) -> list[Any]:
     return results
 
 
-STAIRS = ("gain", "zero")
+A_TREATMENT = kinds.choice("gain", "zero").worded(
+    '"gain", which takes all stairs as their mean slope, "zero", which takes all by their slope of zero, or None, '
+    "which takes those of quantizers and encoders as their mean slope",
+    "Choose one.",
+    kinds.by_name,
+)
 """Treatments of stairs that can be asked for."""
 NO_STAIRS = Stairs()
 """No stairs are replaced."""
 
 
-def replace_stairs(diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, stairs: str | None) -> Stairs:
+def replace_stairs(flat: FlatDiagram, at: OperatingPoint, stairs: str | None) -> Stairs:
     """Return the stairs that are replaced by their mean slopes.
 
     These are those of blocks that name their steps, with "gain" those of all blocks, and with "zero" none.
     """
-    if stairs is not None and (not isinstance(stairs, str) or stairs not in STAIRS):
-        raise OptionError(
-            f'found stairs={stairs!r}; expected "gain", which takes all stairs as their mean slope, "zero", which '
-            "takes all by their slope of zero, or None, which takes those of quantizers and encoders as their mean "
-            "slope. Choose one.",
-            block=diagram.name,
-            port="stairs",
-        )
     return NO_STAIRS if stairs == "zero" else Stairs.of(flat, at, every=stairs == "gain")

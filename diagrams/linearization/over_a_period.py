@@ -421,7 +421,7 @@ def model_ticks(
     """Return the models of all ticks of a sampled diagram's period, and the names of their states."""
     flat = diagram.flatten_like(at)
     injected, measured, cut = ([find_signal(flat, name) for name in names] for names in (inputs, outputs, openings))
-    means = replace_stairs(diagram, flat, at, stairs)
+    means = replace_stairs(flat, at, stairs)
     local = LocalDerivatives(flat, injected, measured, cut, evaluators_at(flat, at), means)
     chain = Chain(flat, local, at, None, period_of(flat))
     chain.go_on()

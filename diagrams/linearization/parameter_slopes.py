@@ -110,7 +110,7 @@ def loop_of_variant(
     flat = diagram.flatten_like(at)
     at.check_fits(flat, diagram.name)
     taps = [find_signal(flat, w) for w in wires]
-    outside, means = evaluators_at(flat, at), replace_stairs(diagram, flat, at, model.stairs)
+    outside, means = evaluators_at(flat, at), replace_stairs(flat, at, model.stairs)
     local, closed = (LocalDerivatives(flat, t, t, t, outside, means) for t in (taps, []))
     made = _model_at(model, flat, diagram, at, local, closed, slow)
     rests = bool(np.max(np.abs(made.affine), initial=0.0) <= EQUILIBRIUM)
@@ -178,7 +178,7 @@ class _Cut:
         key, at = id(flat), self.model.point
         if key not in self._known:
             taps = [find_signal(flat, w) for w in self.wires]
-            outside, means = evaluators_at(flat, at), replace_stairs(diagram, flat, at, self.model.stairs)
+            outside, means = evaluators_at(flat, at), replace_stairs(flat, at, self.model.stairs)
             made = [LocalDerivatives(flat, t, t, t, outside, means) for t in (taps, [])]
             self._known[key] = (flat, at, made[0], made[1])
         return self._known[key][2:]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from ...blocks.core import Block, FmuError, Layout, LoopwrightError, OptionError, ParameterError
+from ...blocks.core import Block, FmuError, Layout, LoopwrightError, OptionError, ParameterError, kinds
 from ...fmus.platform import is_built_here
 from ...fmus.running import Derivation, FmuLinearization, linearize_fmu, step_gap
 from ..flat import FlatDiagram, StateLayout, WiredDiagram
@@ -25,7 +25,9 @@ from .identification import identify_step
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
 
-WAYS = ("equations", "step", "identified")
+A_WAY = kinds.one_of("equations", "step", "identified").worded(
+    "one of 'equations', 'step', 'identified', or None", found=kinds.by_name
+)
 """Methods for the linear model of an FMU's step."""
 SOLVED, COARSE = 1e-9, 1e-5
 """Distances of an FMU's step from its equations: up to which they are one, and beyond which the step is the model."""
@@ -159,7 +161,6 @@ def plant_changes(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray
 
 def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> list[PlantModel]:
     """Return the linear models of the equations of all FMUs."""
-    check_way(way)
     if way == "step" and plant_paths(flat):
         raise OptionError(
             'found plants="step" for a continuous model, which has no step; expected None, "equations" or a step. Give '
@@ -188,14 +189,6 @@ def _plant_model(flat: FlatDiagram, path: str, m: FmuLinearization, **more: Any)
         uncertainty=_largest_error(m),
         **more,
     )
-
-
-def check_way(way: str | None) -> None:
-    """Refuse an unknown way of linearizing an FMU's step."""
-    if way is not None and (not isinstance(way, str) or way not in WAYS):
-        raise OptionError(
-            f"found plants={way!r}; expected one of {', '.join(map(repr, WAYS))}, or None. Choose one of them."
-        )
 
 
 def model_step(

@@ -30,7 +30,6 @@ from .left_out_effects import EventWithinPeriod, UnusualStart
 from .plant_models import (
     EQUILIBRIUM,
     PlantModel,
-    check_way,
     fmu_at,
     inputs_before,
     join_matrices,
@@ -94,7 +93,6 @@ class Chain:
         *,
         every: bool = False,
     ):
-        check_way(way)
         self._coupled = coupling_at(flat, local, at)
         self.flat, self.local, self.way, self.frozen = flat, local, way, frozen
         self.first = self.here = at

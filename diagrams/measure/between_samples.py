@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...blocks.core import LoopwrightError
-from ..flat import WiredDiagram, own_step, takes_any_step
+from ..flat import FlatDiagram, WiredDiagram, own_step, takes_any_step
 from ..linearization import Linearization, find_flow_poles, linearize_within
 from ..results import OperatingPoint
 from ..wiring import stepped_blocks
@@ -40,6 +40,12 @@ class Instants:
     count: int = 1  # instants in a sample; they divide its ticks evenly
     looked: int = 1  # parts of a tick of the diagram at which the linear model is looked at
     turns: float = 0.0  # time constants of the fastest mode between two ticks, or radians of it, in a sample
+
+
+def moves_between(flat: FlatDiagram, port: tuple[str, str]) -> bool:
+    """Return whether a block's signal follows continuous states, or time, between two ticks."""
+    output = flat.output(port)
+    return bool(output.depends("y", "x")[:, flat.continuous].any() or output.depends("y", "t").any())
 
 
 def choose_instants(diagram: WiredDiagram, point: OperatingPoint, ticks: int, samples: int) -> Instants:

@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
-from ..flat import FlatDiagram, WiredDiagram
+from ..flat import WiredDiagram
 from ..linearization import (
     RUN_OPTIONS,
     PointLike,
@@ -57,6 +57,7 @@ from ..results import OperatingPoint, PointOrigin, Snapshot
 from ..solvers import FIXED
 from ..wiring import exact_time
 from .beginning import with_ticks
+from .between_samples import moves_between
 from .injection import InjectionRun, inject_signal
 from .measurement import Measurement, measure_part, refine_tolerances
 from .waveforms import KINDS, Part, choose_step, plan_signal
@@ -355,7 +356,7 @@ def frequency_response(
         found.windows,
         found.settled,
         found.moved,
-        not discrete or (found.held and not _changes_between_ticks(flat, signal.port)),
+        not discrete or (found.held and not moves_between(flat, signal.port)),
         signal.labels,
         labels,
         consumers,
@@ -401,9 +402,3 @@ def _find_continuous_beginning(
     point = with_ticks(operating_point(diagram, at, {**EXACT, **run}), longest)
     options.pop("start", None)
     return {**options, "step": point.base}, point, point.t
-
-
-def _changes_between_ticks(flat: FlatDiagram, port: tuple[str, str]) -> bool:
-    """Whether a signal depends on continuous states, or on time, between two ticks."""
-    output = flat.output(port)
-    return bool(output.depends("y", "x")[:, flat.continuous].any() or output.depends("y", "t").any())

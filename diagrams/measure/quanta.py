@@ -15,7 +15,7 @@ import numpy as np
 
 from ...blocks.core import explain_calls
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import Linearization, find_signal, linearize
+from ..linearization import Linearization, find_signal, linearize, wire_entries
 from ..results import OperatingPoint
 from ..wiring import join
 from .step_response import predict
@@ -69,11 +69,10 @@ def find_converters(flat: FlatDiagram) -> list[Converter]:
             wire = flat.table.wires.get((path, source))
             if wire is None or path not in flat.checked.traced:
                 continue
-            signal = find_signal(flat, join(wire.block, wire.port))
-            whole = np.array(signal.entries).reshape(flat.checked.shapes[signal.port])
-            part = whole if wire.index is None else np.asarray(whole[wire.index])
-            size = np.broadcast_to(np.asarray(getattr(block, parameter), dtype=float), part.shape)
-            found.append(Converter(path, source, np.ravel(size), signal.name, tuple(np.ravel(part).tolist())))
+            shape = flat.checked.traced[path].inputs[source]
+            size = np.broadcast_to(np.asarray(getattr(block, parameter), dtype=float), shape)
+            signal = join(wire.block, wire.port)
+            found.append(Converter(path, source, np.ravel(size), signal, wire_entries(flat, wire)))
     return found
 
 

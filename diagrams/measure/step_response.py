@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, SimulationError, accepts, brief, explain_calls, kinds
-from ..flat import FlatDiagram, WiredDiagram
+from ..flat import WiredDiagram
 from ..frequency import advance_held
 from ..linearization import (
     EQUILIBRIUM,
@@ -34,7 +34,7 @@ from ..linearization import (
 from ..results import ExpectedStep
 from ..wiring import stepped_blocks
 from .beginning import can_start_at, with_ticks
-from .between_samples import BETWEEN, SMOOTH, Instants, WithinSamples, can_step_finer, choose_instants
+from .between_samples import BETWEEN, SMOOTH, Instants, WithinSamples, can_step_finer, choose_instants, moves_between
 from .injection import InjectionRun, inject_signal
 
 SAMPLES = 1000
@@ -235,7 +235,7 @@ def step_response(
     made = inject_signal(variant, signal, 1, held)
     count = max(2, math.ceil(length / float(period)) + sampled)  # a step that is held begins a sample later
     entries = 1 + sum(len(tap.labels) for tap in taps)
-    follows = [_follows_states(flat, tap.port) for tap in (signal, *taps)]
+    follows = [flat.table.blocks[tap.port[0]].stepped or moves_between(flat, tap.port) for tap in (signal, *taps)]
     moves = np.repeat(follows, [1, *(len(tap.labels) for tap in taps)]) if sampled else np.zeros(entries, dtype=bool)
     instants, unread = Instants(), tuple[str, ...]()
     within: WithinSamples | None = None
@@ -310,10 +310,10 @@ def step_response(
     except LoopwrightError:
         pass
     labels = tuple(label for tap in taps for label in tap.labels)
-    is_held = bool(held) and steady and not _follows_states(flat, signal.port)
+    is_held = bool(held) and steady and not follows[0]
     columns = [is_held]
-    for tap in taps:
-        renewed = ticks_between_renewals(flat, [tap.port]) if sampled and not _follows_states(flat, tap.port) else None
+    for tap, moving in zip(taps, follows[1:], strict=True):
+        renewed = ticks_between_renewals(flat, [tap.port]) if sampled and not moving else None
         columns += [renewed is not None and renewed % every == 0 and not wait] * len(tap.labels)
     return StepResponse(
         wire,
@@ -460,11 +460,3 @@ def find_final(model: Linearization) -> np.ndarray:
         once, twice = C @ M[:n, n] + D, C @ (M @ M)[:n, n] + D
         rests = np.abs(twice - once) <= 1e-9 * size + 1e-6 * np.maximum(np.abs(once), np.abs(twice))
     return np.where(rests & np.isfinite(once), once, np.nan)
-
-
-def _follows_states(flat: FlatDiagram, port: tuple[str, str]) -> bool:
-    """Return whether a signal changes between two ticks: it is an FMU's, or depends on continuous states or time."""
-    if flat.table.blocks[port[0]].stepped:
-        return True
-    output = flat.output(port)
-    return bool(output.depends("y", "x")[:, flat.continuous].any() or output.depends("y", "t").any())
