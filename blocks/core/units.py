@@ -43,7 +43,7 @@ class Unit:
     """
 
     text: str
-    exponents: tuple[int, int, int, int, int, int, int, int]
+    exponents: tuple[int, ...]
     factor: float = 1.0
     offset: float = 0.0
     relative: bool = False
@@ -73,8 +73,7 @@ class DefinedUnit(str):
 
 
 def _unit(factor: float = 1.0, offset: float = 0.0, **powers: int) -> Unit:
-    kg, m, s, A, K, mol, cd, rad = (powers.get(base, 0) for base in BASE_UNITS)
-    return Unit("", (kg, m, s, A, K, mol, cd, rad), factor, offset)
+    return Unit("", tuple(powers.get(base, 0) for base in BASE_UNITS), factor, offset)
 
 
 # Units that take a prefix (k, m, µ, …), then those that don't.
@@ -212,11 +211,10 @@ def _parse(text: str) -> Unit:
         raise UnitError(f"the unit {text!r} can't be read at ''. {_NEXT}")
     if len(factors) > 1 and any(unit.offset for unit, _ in factors):
         raise UnitError(f"the unit {text!r} has a temperature with an offset as a factor. Use 'K' for differences.")
-    exponents = [sum(unit.exponents[i] * power for unit, power in factors) for i in range(len(BASE_UNITS))]
-    kg, m, s, A, K, mol, cd, rad = exponents
+    exponents = tuple(sum(unit.exponents[i] * power for unit, power in factors) for i in range(len(BASE_UNITS)))
     factor = math.prod(unit.factor**power for unit, power in factors)
     offset = factors[0][0].offset if len(factors) == 1 else 0.0
-    return Unit(text, (kg, m, s, A, K, mol, cd, rad), factor, offset)
+    return Unit(text, exponents, factor, offset)
 
 
 def _read(unit: Unit | str) -> Unit:
@@ -242,13 +240,7 @@ def same_unit(a: Unit | str, b: Unit | str) -> bool:
 
 
 def convert_unit(a: Unit | str, b: Unit | str) -> tuple[float, float]:
-    """Return the factor and the offset by which a number in ``a`` becomes one in ``b``: factor · number + offset.
-
-    Examples
-    --------
-    >>> convert_unit("°C", "K")
-    (1.0, 273.15)
-    """
+    """Return the factor and the offset by which a number in ``a`` becomes one in ``b``: factor · number + offset."""
     a, b = _read(a), _read(b)
     if not same_dimension(a, b):
         raise UnitError(f"{describe_mismatch(a, b)}.")
@@ -257,13 +249,7 @@ def convert_unit(a: Unit | str, b: Unit | str) -> tuple[float, float]:
 
 
 def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
-    """Name the difference between ``a`` (where a wire starts) and ``b`` (where it ends), and the remedy.
-
-    Examples
-    --------
-    >>> describe_mismatch("mm", "m")
-    'mm and m differ by a factor of 0.001: put Gain(gain=0.001) between'
-    """
+    """Name the difference between ``a`` (where a wire starts) and ``b`` (where it ends), and the remedy."""
     a, b = _read(a), _read(b)
     if same_unit(a, b):
         return f"{a.text} and {b.text} are the same"
@@ -284,18 +270,13 @@ def combine_units(*factors: tuple[str, int]) -> str | None:
     """Return the unit of a product of powers, such as ``m/s`` of m and s⁻¹; None where a factor has an offset.
 
     Numbers in it count as angles as well as not, if an angle is among the factors: the speed r ω is in m/s.
-
-    Examples
-    --------
-    >>> combine_units(("m/s", 1), ("s", -1)), combine_units(("N", 1), ("m", 1)), combine_units(("m", 1), ("mm", -1))
-    ('m/s2', 'N.m', 'm/mm')
     """
     read = [(parse_unit(text), power) for text, power in factors]
     if any(unit.offset and not unit.relative for unit, _ in read):
         return None
     text = _write_unit([(symbol, n * power) for unit, power in read for symbol, n in _symbol_powers(unit)])
-    kg, m, s, A, K, mol, cd, rad = (sum(u.exponents[i] * n for u, n in read) for i in range(len(BASE_UNITS)))
-    made = Unit(text, (kg, m, s, A, K, mol, cd, rad), math.prod(u.factor**n for u, n in read))
+    exponents = tuple(sum(u.exponents[i] * n for u, n in read) for i in range(len(BASE_UNITS)))
+    made = Unit(text, exponents, math.prod(u.factor**n for u, n in read))
     loose = any(unit.exponents[-1] or unit.loose_angle for unit, _ in read)
     if not loose and not any(isinstance(factor, DefinedUnit) for factor, _ in factors):
         return text
@@ -303,13 +284,7 @@ def combine_units(*factors: tuple[str, int]) -> str | None:
 
 
 def root_unit(text: str, degree: int) -> str | None:
-    """Return the unit of a root, such as ``m`` of ``m2``; None where it has none, as of ``m``.
-
-    Examples
-    --------
-    >>> root_unit("m2/s2", 2), root_unit("m", 2)
-    ('m/s', None)
-    """
+    """Return the unit of a root, such as ``m`` of ``m2``; None where it has none, as of ``m``."""
     unit = parse_unit(text)
     powers = dict(_symbol_powers(unit))
     if unit.offset or any(n % degree for n in (*powers.values(), *unit.exponents)):
@@ -317,19 +292,12 @@ def root_unit(text: str, degree: int) -> str | None:
     written = _write_unit([(symbol, n // degree) for symbol, n in powers.items()])
     if not isinstance(text, DefinedUnit):
         return written
-    kg, m, s, A, K, mol, cd, rad = (n // degree for n in unit.exponents)
-    made = Unit(written, (kg, m, s, A, K, mol, cd, rad), unit.factor ** (1 / degree), loose_angle=unit.loose_angle)
-    return DefinedUnit(made)
+    exponents = tuple(n // degree for n in unit.exponents)
+    return DefinedUnit(Unit(written, exponents, unit.factor ** (1 / degree), loose_angle=unit.loose_angle))
 
 
 def raise_unit(text: str, exponent: float) -> str | None:
-    """Return the unit of a power, such as ``m2`` of m with exponent 2; None where it has none, as of m with 0.3.
-
-    Examples
-    --------
-    >>> raise_unit("m", 2), raise_unit("m2", 1.5), raise_unit("s", -1), raise_unit("m", 0.3)
-    ('m2', 'm3', '1/s', None)
-    """
+    """Return the unit of a power, such as ``m2`` of m with exponent 2; None where it has none, as of m with 0.3."""
     ratio = Fraction(exponent).limit_denominator(12)
     if not math.isclose(ratio, exponent, rel_tol=1e-12):
         return None
@@ -362,13 +330,7 @@ _PRINTED = {"1": "", "deg": "°"}
 
 
 def print_unit(text: str) -> str:
-    """Return a unit as it is printed, empty for a pure number.
-
-    Examples
-    --------
-    >>> print_unit("N.s/m"), print_unit("m/s2"), print_unit("deg"), print_unit("1")
-    ('N·s/m', 'm/s²', '°', '')
-    """
+    """Return a unit as it is printed, ``N·s/m`` or ``m/s²``, empty for a pure number."""
     if text in _PRINTED:
         return _PRINTED[text]
     raised = re.sub(r"(?<=[A-Za-z])(-?\d+)", lambda m: m[1].translate(_WRITTEN), text)
@@ -376,13 +338,7 @@ def print_unit(text: str) -> str:
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Return the name of a quantity with its unit, as heads of tables and axes of figures have it.
-
-    Examples
-    --------
-    >>> with_unit("t", "s"), with_unit("|S|", "1")
-    ('t [s]', '|S|')
-    """
+    """Return the name of a quantity with its unit, as heads of tables and axes of figures have it: ``t [s]``."""
     shown = print_unit(unit)
     return f"{name} [{shown}]" if shown else name
 

@@ -83,7 +83,7 @@ def with_zeros(column: Any, zero: np.ndarray) -> Any:
 
 
 def is_nonzero(value: Any) -> bool:
-    """Whether a number is other than 0; a symbol that stands for one is, since exact zeros are structure."""
+    """Whether a number is other than 0; a symbol in its place is, since exact zeros are structure."""
     return not value.to_casadi().is_zero() if isinstance(value, ArrayInterface) else bool(value != 0.0)
 
 

@@ -8,11 +8,15 @@ from loopwright.blocks.core.errors import UnitError
 from loopwright.blocks.core.units import (
     Unit,
     combine_units,
+    convert_unit,
     describe_mismatch,
     parse_unit,
+    print_unit,
+    raise_unit,
     rate_of,
     root_unit,
     same_unit,
+    with_unit,
 )
 
 # By hand, from the definitions of the SI units: (kg, m, s, A, K, mol, cd, rad), factor.
@@ -166,3 +170,13 @@ def test_power_with_an_angle_is_power_without_one():
     assert same_unit(combine_units(("N.m", 1), ("rad/s", 1)), "W")
     assert not same_unit(combine_units(("N.m", 1), ("rpm", 1)), "W")
     assert not same_unit(combine_units(("N.m", 1), ("1/s", 1)), "W.rad")
+
+
+def test_powers_conversions_and_print():
+    powers = ("m", 2), ("m2", 1.5), ("s", -1), ("m", 0.3)
+    assert [raise_unit(*power) for power in powers] == ["m2", "m3", "1/s", None]
+    assert [root_unit("m2/s2", 2), root_unit("m", 2), combine_units(("m", 1), ("mm", -1))] == ["m/s", None, "m/mm"]
+    assert convert_unit("°C", "K") == (1.0, 273.15)
+    assert describe_mismatch("mm", "m") == "mm and m differ by a factor of 0.001: put Gain(gain=0.001) between"
+    assert [*map(print_unit, ("N.s/m", "m/s2", "deg", "1"))] == ["N·s/m", "m/s²", "°", ""]
+    assert [with_unit("t", "s"), with_unit("|S|", "1")] == ["t [s]", "|S|"]
