@@ -933,6 +933,7 @@ class Diagram(ShownAsTable):
         from .simulation import work_notes
         from .studies import find_worst_case
 
+        # Studies know no progress bar: they call a function with a line for each case.
         with work_notes(self.name, progress) as notify:
             return find_worst_case(
                 self.wired,

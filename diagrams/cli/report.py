@@ -162,7 +162,7 @@ def report_command(arguments: argparse.Namespace) -> int:
         if searched is not None:
             searched.check(diagram.wired, asked)
         if touched is not None:
-            touched.check(diagram.wired)
+            touched.find(diagram.wired)
         began = time.perf_counter()
         about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:

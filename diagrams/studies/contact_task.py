@@ -68,12 +68,8 @@ class ContactTask:
                 limits[name] = _read_limits(file, table[REQUIRED], f"{key}.{REQUIRED}")
         return cls(file, {name: {k: v for k, v in t.items() if k != REQUIRED} for name, t in named.items()}, limits)
 
-    def check(self, diagram: WiredDiagram) -> None:
-        """Make the contacts, before anything else is computed."""
-        self.find(diagram)
-
     def find(self, diagram: WiredDiagram) -> Mapping[str, Contact]:
-        """Return the contacts by their names."""
+        """Return the contacts by their names; each is made once for a diagram."""
         for name, given in self.places.items():
             if name in self._made and self._made[name].wired is diagram:
                 continue

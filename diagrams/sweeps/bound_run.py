@@ -38,7 +38,7 @@ class BoundRun:
         self.count, rest = ticks_in(duration, self.flat.base, diagram.name)
         if rest:
             refuse_rest(self.flat, self.count, duration, diagram.name)
-        self._end = float(self.count * self.flat.base + rest) if rest else None
+        self.end = float(self.count * self.flat.base + rest) if rest else None  # in s, where it is between two ticks
         record, every, states = options.record, options.every, options.states
         self._recording = Recording(self.flat, diagram.name, record, every, states, None, False)
         every_tick = base is not None or EVERY in self.flat.visited
@@ -102,11 +102,6 @@ class BoundRun:
         return continuous is None or continuous.fits(self.flat.table.blocks, numbers.blocks)
 
     @property
-    def ends_between_ticks(self) -> bool:
-        """Whether the duration is no whole number of ticks."""
-        return self._end is not None
-
-    @property
     def is_compiled(self) -> bool:
         """Whether it goes by generated code."""
         return self.engine.is_compiled
@@ -126,8 +121,8 @@ class BoundRun:
             if engine.position.stopped is None:
                 if self.count:
                     engine.go(self.count, recorder, progress)
-                if self._end is not None and engine.position.stopped is None:
-                    engine.end_between_ticks(self._end, recorder, progress)
+                if self.end is not None and engine.position.stopped is None:
+                    engine.end_between_ticks(self.end, recorder, progress)
         except SimulationError as error:
             culprit = engine.blame(error).at(t=engine.position.t)
             raise culprit.keep(self._take_record(started)) from culprit.__cause__

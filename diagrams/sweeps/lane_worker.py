@@ -141,7 +141,7 @@ class _Lanes:
         if not bound.is_compiled:
             reason = next(iter(engine.messages), "compile=True was not asked for")
             raise NoLanesError(f"they don't go from tick to tick in C ({reason.rstrip('.')})")
-        if bound.ends_between_ticks:
+        if bound.end is not None:
             raise NoLanesError("their duration is no whole number of ticks")
         acting = kinds_of(flat, every=engine.every_tick)
         visited = [EVERY] if engine.every_tick else [*flat.visited]

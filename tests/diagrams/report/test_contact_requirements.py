@@ -141,7 +141,7 @@ def write(path, *texts):
 )
 def test_a_file_that_makes_no_contact_is_refused_with_its_line(tmp_path, text, words):
     with pytest.raises(OptionError, match=words):
-        ContactTask.read(write(tmp_path / "c.toml", text)).check(cart_diagram().wired)
+        ContactTask.read(write(tmp_path / "c.toml", text)).find(cart_diagram().wired)
 
 
 def test_a_file_of_contacts_has_the_numbers_of_the_diagrams_own(tmp_path):
