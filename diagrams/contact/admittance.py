@@ -50,13 +50,13 @@ class ContactAdmittance:
         return brief("admittance at a contact, m/(N s)", *facts, then=".omega, .rendered, .target")
 
 
-BESIDE = 0.05
+AROUND = 0.05
 """Part of a frequency within which the admittance's real part changes its sign next to a limit."""
 
 
 def look_again(parts: ContactParts, direction: np.ndarray, omega: float) -> float:
     """Return the stiffness ω/|Y| at which Re Y(jω) = 0 next to a frequency in rad/s; NaN without one."""
-    low, high = (1.0 - BESIDE) * omega, (1.0 + BESIDE) * omega
+    low, high = (1.0 - AROUND) * omega, (1.0 + AROUND) * omega
     if not 0.0 < low < high < (math.pi / parts.shortest if parts.shortest else math.inf):
         return math.nan
 

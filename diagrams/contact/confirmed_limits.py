@@ -172,7 +172,7 @@ class LimitTrials:
         return min(omega % (2.0 * np.pi / T), -omega % (2.0 * np.pi / T)) if T else omega
 
     def find_own_limit(self) -> float:
-        """Return the limit that runs are tried next to: of a loop with a held force, that of its own linear model."""
+        """Return the limit that runs are tried next to: with a held force, that of that loop's linear model."""
         if self.method is not TrialMethod.HELD:
             return self.limit.value
         x = [0.97 * self.limit.value, self.limit.value]

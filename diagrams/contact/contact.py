@@ -321,7 +321,7 @@ def make_contact(
     diagram = diagram.replace(point.parameters) if point.parameters else diagram  # parameters that a trim has found
     ports = Ports.find(diagram, diagram.flatten_like(point), names)
     parts, unusual = take_apart(diagram, ports, force, point, taken)
-    if unusual:  # a block has a first tick of its own; at rest, the next tick has the same states
+    if unusual:  # a block treats its first tick in another way; at rest, the next tick has the same states
         count = round(parts.sample_time / float(point.base))
         point = _move_on(point, count, float(point.base * count))
         parts, _ = take_apart(diagram, ports, force, point, taken)

@@ -17,7 +17,7 @@ In several rates the period has several ticks. The loop over the period is the p
 next, and its poles z are those of the period.
 
 Modes that the environment can't reach or doesn't feel stay as they are, whatever its properties, such as a drift in
-another direction. `split_modes` tells them by controllability and observability, not by the place of their poles.
+another direction. `split_modes` finds them by controllability and observability, not by the place of their poles.
 
 A mode's pole z over the time T gives its frequency up to multiples of 2π/T, and its sign. `find_frequency` takes that
 of the strongest part of the motion in continuous time.
@@ -39,7 +39,7 @@ from .environment import check_environment
 SLOW, SLOW_RATE = 1e-3, 1.0
 """Distance of |z| from 1, and rate in 1/s, within which a stable mode is looked at."""
 _RANK = 1e-9
-"""Part of a direction, relative to the directions found before, below which it is none of its own."""
+"""Part of a direction, relative to the directions found before, below which it is no further one."""
 _SAFETY = 10.0
 """Factor on the rounding of a matrix, for the routines that it goes through."""
 

@@ -3,7 +3,7 @@
 The diagram's own force on the plant comes by the wire of the force port, if there is one. The measured force is another
 wire, behind the force sensor. Where the first leads to the second at once and unchanged, the environment's force is
 added to the second. Where a delay, a filter, a gain or a slower clock lies between them, where the first leads to the
-plant's other inputs on ways of its own, too, and where both are one wire, it is added to the first, for all its readers
+plant's other inputs on other ways, too, and where both are one wire, it is added to the first, for all its readers
 but the plant: so it takes those ways, too.
 
 Without a way between the two, nothing distinguishes the sensor from what follows it, and a measured wire behind states

@@ -43,11 +43,11 @@ from .coupled_parts import ContactParts, StateMatrices
 ALIASES = 16
 """Aliases on each side that are summed one by one."""
 POINTS = 60
-"""Frequencies at which a sampled loop is looked at first, besides those of its poles."""
+"""Frequencies at which a sampled loop is looked at first, in addition to those of its poles."""
 PRECISE = 1e-6
 """Error of the margin of a sampled loop."""
 LOWEST_SHARE = 1e-3
-"""Lowest frequency in π/T: below it, the margin is lost in rounding, and stands still without slow modes."""
+"""Lowest frequency in π/T: below it, the margin is lost in rounding, and does not change without slow modes."""
 MINIMA = 4
 """Lowest minima of the margin that are refined."""
 _ROUNDED = 1e-9
@@ -216,8 +216,8 @@ class _Aliases:
         poles = np.linalg.eigvals(close_loop(self.parts, self.joined).A)
         rates = np.log(poles[np.abs(poles) > 1e-12].astype(complex)) / self.T
         rates = np.concatenate([rates, np.linalg.eigvals(self.joined.A)])
-        beside = np.array([-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])
-        near = np.abs(rates.imag)[:, None] + np.abs(rates.real)[:, None] * beside
+        offsets = np.array([-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])
+        near = np.abs(rates.imag)[:, None] + np.abs(rates.real)[:, None] * offsets
         near = np.abs((near + top) % (2.0 * top) - top).ravel()  # aliases of the plant's own, too
         spread = np.concatenate(
             [np.geomspace(LOWEST_SHARE * top, top, POINTS), np.linspace(LOWEST_SHARE * top, top, POINTS)]

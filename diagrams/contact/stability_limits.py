@@ -67,7 +67,7 @@ def growth_rounding(modes: Modes, rates: Callable[[np.ndarray], np.ndarray], A: 
 
     The growth rate is computed again with every entry of the matrix changed by some roundings. Where the fixed modes
     are split off, every entry, zeros too, is changed by some roundings of the largest one next to it, as LAPACK's
-    transformations do. The eigenvalues answer as they do to the rounding of any machine: one that stands alone by as
+    transformations do. The eigenvalues answer as they do to the rounding of any machine: one that is alone by as
     much, several in one place by far more.
     """
     if not np.isfinite(A).all():
@@ -100,7 +100,7 @@ class FoundLimit(NamedTuple):
 
 
 def scan_points(name: str, ends: tuple[float | None, float | None], per_decade: int) -> np.ndarray:
-    """Return the values of a property at which its scan looks; None stands for the usual end, see `SCANNED`."""
+    """Return the values of a property at which its scan looks; None is the usual end, see `SCANNED`."""
     first, last = (usual if end is None else end for usual, end in zip(SCANNED[name], ends, strict=True))
     if not 0.0 < first < last < math.inf:
         raise OptionError(

@@ -4,7 +4,7 @@ The speed of most drives is the difference of two angles of an encoder: the angl
 with the angle. Nothing comes of it, as the last angle shifts, too. At one point alone this would prove nothing: a dead
 zone and an actuator at its limit answer a shift by nothing, too. So the block's equations are evaluated at points of
 all sizes. There the answer to a shift has to be the same everywhere, and in proportion to it. What a block passes on
-is a signal of its own, which may not shift either.
+is another signal, which may not shift either.
 """
 
 from __future__ import annotations

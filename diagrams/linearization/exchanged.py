@@ -1,4 +1,4 @@
-"""FMUs in model exchange at an operating point: instances of their own, for linear models and trims."""
+"""FMUs in model exchange at an operating point: instances for linear models and trims alone."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class PointEvaluator(ModelExchangeEvaluator):
     def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
         """Return the derivative of `evaluate`; the FMU's own is held against differences where it is asked for first.
 
-        Where it is plainly wrong, differences stand in for it from then on. The last ones are kept: the loops at all
+        Where it is plainly wrong, differences replace it from then on. The last ones are kept: the loops at all
         wires, and the slopes along all parameters, ask for them at the same instants.
         """
         key = names, t, x.tobytes(), u.tobytes(), self.derivation.refuted
@@ -118,7 +118,7 @@ class _Held(dict[str, PointEvaluator]):
 def evaluators_at(flat: FlatDiagram, at: OperatingPoint) -> Evaluators | None:
     """Return the evaluators of the FMUs in model exchange at an operating point; None without such FMUs.
 
-    Each point has instances of its own, with the discrete states there.
+    Each point has its own instances, with the discrete states there.
     """
     if not flat.in_model_exchange:
         return None

@@ -277,7 +277,7 @@ def _null(S: np.ndarray) -> np.ndarray:
 
 
 def _localize(V: np.ndarray, M: np.ndarray, rest: float) -> np.ndarray:
-    """Return the basis of a space of null vectors in which each one has a state of its own.
+    """Return the basis of a space of null vectors in which each one has a state that the others lack.
 
     Zeros that rounding moved are 0. ``rest`` is the relative size of singular values that count as none.
     """

@@ -237,9 +237,9 @@ def _consumers(wires: dict[Port, Wire], port: Port) -> list[Port]:
 
 
 def find_cut_findings(
-    flat: FlatDiagram, at: OperatingPoint, cut: Sequence[Port], carried: Sequence[Finding]
+    flat: FlatDiagram, at: OperatingPoint, cut: Sequence[Port], reported: Sequence[Finding]
 ) -> tuple[Finding, ...]:
-    """Return the findings about inputs that a cut wire also feeds; those of ``carried`` are reported already."""
+    """Return the findings about inputs that a cut wire also feeds; those that are ``reported`` already are left out."""
     ways = SignalPaths(flat, cut)
     after, before = ways.after(cut), ways.before(cut)
     on_loop = {
@@ -247,8 +247,8 @@ def find_cut_findings(
         for n in after
         if not n.is_output and any(PathNode(n.block, p, True) in before for p in flat.table.blocks[n.block].outputs)
     }
-    reported = {(f.block, f.source) for f in carried if isinstance(f, BlockFinding)}
-    inert = _find_inert(flat, at, cut, on_loop - reported)
+    known = {(f.block, f.source) for f in reported if isinstance(f, BlockFinding)}
+    inert = _find_inert(flat, at, cut, on_loop - known)
     tracking = _find_tracking(flat, ways, cut, on_loop, before)
     return (*tracking, *find_shared_cuts(flat, cut, lambda port: _name_of(flat, port)), *inert)
 

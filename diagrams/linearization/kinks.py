@@ -45,7 +45,7 @@ HALVINGS = 16
 """Halvings of the interval around a kink that it must survive."""
 NO_SLOPE = 1e-9
 """Share of a change over the nominal range up to which a slope that explains no more counts as zero."""
-BESIDE = 1e-2
+ASIDE = 1e-2
 """Distance to both sides, relative to the nominal value, at which an extremum is distinguished from a flat place."""
 JUMP = 1e-9
 """Smallest jump and change that count, relative to 1 + the size of the value."""
@@ -265,7 +265,7 @@ class _BlockAtPoint:
         found = (slope * span <= NO_SLOPE * np.abs(change)) & (np.abs(change) > JUMP * (1.0 + np.abs(f0)))
         if not np.any(found):
             return
-        down, up = (self._values(column, s * BESIDE * span) - f0 for s in (-1, 1))
+        down, up = (self._values(column, s * ASIDE * span) - f0 for s in (-1, 1))
         found &= ~(down * up > 0)  # a smooth extremum, where a slope of zero is right
         for row in np.flatnonzero(found & np.isfinite(change)):
             port, source = self.slopes.rows.name_at(int(row))[2:], self.slopes.columns.name_at(column)[2:]

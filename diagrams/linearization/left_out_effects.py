@@ -1,8 +1,8 @@
 """Findings about a linear model: the effects that it leaves out.
 
 A finding has its facts as fields, and its text as ``str(…)``. `Linearization.findings` holds all of them; select a kind
-by its class: ``[f for f in model.findings if isinstance(f, StepsOnly)]``. Those that lie on a loop are carried by the
-loop, and by every number that is made from it.
+by its class: ``[f for f in model.findings if isinstance(f, StepsOnly)]``. Those that lie on a loop go with the
+loop, and with every number that is made from it.
 """
 
 from __future__ import annotations

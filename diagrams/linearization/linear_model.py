@@ -537,9 +537,9 @@ def linearize(
     """Linearize a diagram; see `Diagram.linearize`."""
     check_argument(delays, kinds.choice("exact", "pade"), "delays", "linearize")
     check_argument(order, kinds.integer(1), "order", "linearize")
-    for name, given, kind in (("plants", plants, A_WAY), ("stairs", stairs, A_TREATMENT)):
-        if given is not None:
-            check_argument(given, kind, name, diagram.name)
+    for name, asked, kind in (("plants", plants, A_WAY), ("stairs", stairs, A_TREATMENT)):
+        if asked is not None:
+            check_argument(asked, kind, name, diagram.name)
     check_options(options, "linearize")
     at = operating_point(diagram, point, options)
     if delays == "pade" and _is_discrete(diagram, options.get("step")):

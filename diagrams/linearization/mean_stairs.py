@@ -44,7 +44,7 @@ class Stair:
 class Stairs:
     """Stairs of a diagram that a linear model replaces by their mean slopes.
 
-    The row of a stair gets a signal e besides its own value, and v is the input of the stair; then e = K v.
+    The row of a stair gets a signal e in addition to its own value, and v is the input of the stair; then e = K v.
     """
 
     def __init__(self, stairs: Sequence[Stair] = ()):

@@ -248,7 +248,7 @@ def _choose_step(diagram: WiredDiagram, t: float) -> Fraction:
 
 
 def refine_ticks(diagram: WiredDiagram, point: OperatingPoint, parts: int) -> OperatingPoint:
-    """Return an operating point on ticks that divide the time between two of its own; FMUs step to each of them.
+    """Return an operating point on ticks that divide the time between two of its ticks; FMUs step to each of them.
 
     Between ticks at which something acts, more signals are held than without such ticks: they have their values at the
     point.

@@ -4,8 +4,8 @@ The period is the base period or, with several rates, the least common period of
 
 - *over the period* (`model_period`): injected signals are held over the whole period, and measured at its beginning;
 - *of a loop* (`model_loop`). A signal that is held over the whole period cuts a wire's loop only if the wire is renewed
-  once in the period, at its beginning: the period of a loop begins at a tick at which the wire's source acts. A signal
-  of its own is injected at every tick. Ticks between which the wire stays the same make one channel; a channel that
+  once in the period, at its beginning: the period of a loop begins at a tick at which the wire's source acts. Another
+  signal is injected at every tick. Ticks between which the wire stays the same make one channel; a channel that
   nothing on the loop uses is left out. A wire that is renewed once has one channel, and L. A wire that is renewed N
   times has a periodic loop: no L at one rate, but a lifted L of N × N, with a channel for each renewal;
 - *of each tick* (`model_ticks`), for an environment at the plant, which moves between them.

@@ -1,6 +1,6 @@
 """Wires with several ways back: to the plant, and within the controller itself.
 
-A Smith predictor or an observer feeds the plant's input to a model of its own as well. A cut of the wire behind its
+A Smith predictor or an observer feeds the plant's input to its model of the plant as well. A cut of the wire behind its
 port separates both from it. The loop at the plant's input is that of a cut ahead of the plant alone.
 
 A wire acts on the blocks with states that it leads to through blocks without states, such as a saturation: these
@@ -15,8 +15,8 @@ A wire that enters a sampled subsystem, and acts nowhere else, is one signal for
 the parts of a PI law: no cut is made ahead of one of them. Nor is one where what is in continuous time puts a wire out
 and sampled blocks alone read it: that is a measurement, such as the angle that two loops of a drive follow.
 
-Where this leaves several entries, nothing tells the parallel parts of a plant from a plant and a model of it, as their
-graphs are the same: the cuts ahead of each are then as possible as that for all of them.
+Where this leaves several entries, parallel parts of a plant can't be distinguished from a plant and a model of it, as
+their graphs are the same: the cuts ahead of each are then as possible as that for all of them.
 """
 
 from __future__ import annotations
@@ -257,7 +257,7 @@ def _borders(flat: FlatDiagram, source: str) -> Iterator[Callable[[str], bool]]:
 def find_shared_cuts(flat: FlatDiagram, cut: Iterable[Port], name: Callable[[Port], str]) -> tuple[Finding, ...]:
     """Return the findings about cut wires with several ways back; ``name`` names the wire behind a port.
 
-    Inputs that track an output are left out: they have a finding of their own.
+    Inputs that track an output are left out: another finding names them.
     """
     found: list[Finding] = []
     blocks = flat.table.blocks

@@ -174,9 +174,9 @@ class Plants:
             C[w, own] = m.C
             D[np.ix_(w, mine)] = m.D[:, wired]
 
-        def evaluate(i: int, beside: list[np.ndarray]) -> list[np.ndarray]:
+        def evaluate(i: int, others: list[np.ndarray]) -> list[np.ndarray]:
             path, rates, outputs = free[i].path, np.zeros(n), np.zeros(nw)
-            m, rates[self.own[path]] = self._evaluate_one(path, self.change_blocks(free, beside)[path], xp, z)
+            m, rates[self.own[path]] = self._evaluate_one(path, self.change_blocks(free, others)[path], xp, z)
             outputs[plant_entries(flat, path)[1]] = m.y0
             return [rates, outputs]
 
@@ -218,7 +218,7 @@ class ExchangedPlants:
     ) -> list[np.ndarray]:
         """Return the derivatives of vectors by all free parameters: differences, zeros of those of other blocks."""
         sizes = [v.size for v in values]
-        return differentiate_by(self.free, q, self.mine, sizes, lambda _, beside: evaluate(self.evaluators(beside)))
+        return differentiate_by(self.free, q, self.mine, sizes, lambda _, others: evaluate(self.evaluators(others)))
 
 
 def differentiate_by(

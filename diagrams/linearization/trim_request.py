@@ -104,7 +104,7 @@ class Free:
             for place in (0.0, *nodes):
                 moved = value.copy()
                 moved[i] = middle + place * h
-                found.append(np.nan_to_num(self.pack_value(moved)))  # NaN stands for no sample time
+                found.append(np.nan_to_num(self.pack_value(moved)))  # NaN is no sample time
             slope, error = difference(found, h, nodes)
             columns.append(slope)
             errors.append(float(np.max(error, initial=0.0)))

@@ -304,7 +304,7 @@ def find_free_directions(equations: _Equations, unknown: np.ndarray) -> tuple[Fr
 
 
 def _make_basis(rows: np.ndarray) -> np.ndarray:
-    """Return the basis of a space in which each row has a column of its own, 1 there and 0 in the others.
+    """Return the basis of a space in which each row has 1 in one column, where the others have 0.
 
     Singular vectors of one value may be turned against each other. The columns are chosen by their lengths in the
     space, which a turn leaves as they are.

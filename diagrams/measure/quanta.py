@@ -1,4 +1,4 @@
-"""Quanta of a diagram's converters and encoders: test signals that are large beside them, and what is left at rest.
+"""Quanta of a diagram's converters and encoders: test signals that are large next to them, and what is left at rest.
 
 A linear model has the mean slope of their stairs, which a running diagram shows only for motions of many quanta. The
 quantum of a signal is its largest change where one converter's input changes by one quantum for good, with all loops
