@@ -143,7 +143,7 @@ class LocalDerivatives:
             self.cut.setdefault(s.port, set()).update(s.entries)
         self.evaluators = evaluators
         self.direction: np.ndarray | None = None
-        """Direction of the diagram's vector of parameters p, along which slopes are carried."""
+        """Direction of the diagram's vector of parameters p, along which slopes are taken."""
         self.scale, self.error = 1.0, 0.0
         """Size of the parameter, and the largest estimated error of a slope that is made of differences."""
         self._made: dict[tuple[str, frozenset[TickPattern]], Any] = {}

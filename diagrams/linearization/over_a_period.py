@@ -182,7 +182,7 @@ def find_slower_clocks(flat: FlatDiagram, ports: Iterable[tuple[str, str]], name
             return frozenset(clock for clock in flat.distinct if clock.every > every)
     raise OptionError(
         f"found no sampled subsystem that makes or reads {', '.join('.'.join(port) for port in ports)} alone; expected "
-        "one, whose rate tells the slower loops. Take the loop at a wire of a sampled subsystem.",
+        "one, whose rate says which loops are slower. Take the loop at a wire of a sampled subsystem.",
         block=name,
         port="slow",
     )
