@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 from .view import Position
 
 if TYPE_CHECKING:
-    from .compiled_ticks import LaterCode
+    from ..compiled import BackgroundCode
 
+_REPORTED: list[Exception] = []  # the failure that this process has reported
 _PATIENCE = 0.02  # s of interpreted ticks before which nobody thinks of a compiler
 
 
@@ -19,14 +20,14 @@ class ChangeOver:
 
     def __init__(self, position: Position):
         self._position, self._possible = position, True
-        self._later: LaterCode[Any] | None = None
+        self._later: BackgroundCode[Any] | None = None
         self._spent = 0.0
 
     def watch(
         self,
         last: int,
         progress: Callable[[float], Any],
-        make: Callable[[], LaterCode[Any]],
+        make: Callable[[], BackgroundCode[Any]],
         take_over: Callable[[], None],  # called once the code is there
     ) -> Callable[[float], Any]:
         """Return a ``progress`` for an interpreted run from here up to a tick, which has the code made in time."""
@@ -44,16 +45,21 @@ class ChangeOver:
 
         return arrive
 
-    def _look(self, make: Callable[[], LaterCode[Any]], rest: float) -> None:
+    def _look(self, make: Callable[[], BackgroundCode[Any]], rest: float) -> None:
         if self._later is None:
             self._later = make()
-        self._later.background.look(self._spent, rest)
+        self._later.look(self._spent, rest)
 
     def report_failure(self) -> tuple[str, ...]:
         """Return a message that there is no compiler, or one that fails; once in a process."""
-        return () if self._later is None else self._later.report_failure()
+        failure = None if self._later is None else self._later.failure
+        if failure is None or _REPORTED:
+            return ()
+        _REPORTED.append(failure)
+        text = "Interpreted, though the run is long enough for C: {}. compile=False asks for no compiler."
+        return (text.format(str(failure).rstrip(".")),)
 
     @property
     def code(self) -> Any:
         """The code; None while there is none."""
-        return self._later.background.code if self._later is not None and self._later.background.ready else None
+        return self._later.code if self._later is not None and self._later.ready else None

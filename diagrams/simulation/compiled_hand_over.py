@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 
 from ..compiled import (
     CompiledHybrid,
     CompiledLoop,
-    Fired,
     HandedOver,
     HybridCode,
     MethodOptions,
     NativeModelExchange,
-    OwnEvent,
-    Sign,
     TickCode,
 )
 from ..flat import NONE
@@ -79,7 +75,11 @@ def bind_hybrid(
         None
         if blocks is None or continuous.own_events is None
         else HandedOver(
-            flat, blocks.blocks, blocks.evaluators, partial(_report_own_event, continuous), continuous.own_events.count
+            flat,
+            blocks.blocks,
+            blocks.evaluators,
+            lambda event: continuous.report_own_event(*event),
+            continuous.own_events.count,
         )
     )
     native = None if handed is None else handed.native
@@ -113,10 +113,6 @@ def accepts_of(
     flat, judged = workspace.flat, judged and not continuous.fixed
     always = plants or workspace.looped or remembers(flat) or has_guards(flat)
     return 1 if always or (judged and not exchanged) else 2 if judged else 0
-
-
-def _report_own_event(continuous: Continuous, event: OwnEvent) -> None:
-    continuous.report_own_event(*event)
 
 
 def describe_methods(methods: Sequence[MethodOptions], solver: str) -> str:
@@ -174,31 +170,3 @@ class EdgesAhead:
         edges, late = self._found
         first = int(np.searchsorted(edges, t, side="left" if t in self._continuous.late else "right"))
         return edges[first:], late[first:]
-
-
-def active_method(continuous: Continuous) -> int:
-    """Return the place of the method that a run continues with."""
-    return continuous.method.names.index(continuous.method.active) if continuous.where.size else 0
-
-
-def planned_steps(continuous: Continuous) -> list[float | None]:
-    """Return the steps in s that a run's methods would take next."""
-    return [*continuous.method.planned.values()]
-
-
-def restore_plans(continuous: Continuous, steps: Sequence[float | None]) -> None:
-    """Let a run's methods take steps of some lengths in s next."""
-    continuous.method.planned = dict(zip(continuous.method.names, steps, strict=True))
-
-
-def changes_method(workspace: Workspace, continuous: Continuous, t: float, sign: Sign, h: float) -> None:
-    """Decide, after a sign at steps of h in s, whether another method continues from t."""
-    continuous.stand_in(math.inf, math.inf)
-    x = workspace.here.x[continuous.where]
-    workspace.messages += continuous.method.decide(t, x, h, stuck=sign is Sign.STUCK)
-
-
-def report_fired(continuous: Continuous, fired: Sequence[Fired]) -> None:
-    """Report events that have fired in C."""
-    for one in fired:
-        continuous.report_event(one.t, one.event, one.before, one.after)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -18,9 +19,9 @@ from ..compiled import (
     HybridCode,
     HybridOutcome,
     HybridReason,
+    Sign,
     Span,
     compile_hybrid,
-    find_code_obstacle,
     hybrid_sources,
     interpret_hybrid,
 )
@@ -30,18 +31,13 @@ from ..solvers import METHODS
 from .broken_off import explain, explain_library, pile_up
 from .compiled_hand_over import (
     EdgesAhead,
-    active_method,
     bind_hybrid,
-    changes_method,
     describe_methods,
     find_edges,
     methods_of,
-    planned_steps,
-    report_fired,
-    restore_plans,
 )
 from .compiled_plants import PlantsInC
-from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, LaterCode, make_in_c
+from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED
 from .continuous import Continuous
 from .failed_blocks import forget_trials
 from .workspace import Workspace
@@ -64,6 +60,7 @@ class HybridTicks:
         flat = self._flat = workspace.flat
         self._workspace, self._continuous, self._plants = workspace, continuous, plants
         self._stops = stops
+        self._is_fused = fuse
         plants.turn = self._turn
         self._acting, self._stiff = kinds_of(flat, every=every), is_stiff(continuous)
         self._code = find_code(flat, continuous, every=every, machine=machine, fuse=fuse)
@@ -76,16 +73,30 @@ class HybridTicks:
         self._chunk = FIRST
         self._handed: HandedOver | None = None
 
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """How far results may differ from those of an interpreted run; empty where every bit is the same."""
+        continuous = self._continuous
+        compiled = (
+            f"Compiled: {describe_methods(methods_of(continuous), continuous.method.name)}, by the same rules as "
+            "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
+        )
+        fused = (
+            "Fused: ticks and rates are compiled for this processor; values differ by rounding, which some motions "
+            "magnify."
+        )
+        return *((compiled,) if continuous.where.size else ()), *((fused,) if self._is_fused else ())
+
     def hand_over(self, code: HybridCode) -> None:
         """Let generated code of the same functions continue; C must not run meanwhile."""
         self._code.hand_over(code)
         if self._loop is not None:
             self._loop.take_steps(code.steps)
 
-    def make_later(self) -> LaterCode[HybridCode]:
+    def make_later(self) -> BackgroundCode[HybridCode]:
         """Return generated code of these functions that is made while they are interpreted."""
         write = partial(hybrid_sources, self._flat, self._acting, stiff=self._stiff)
-        return LaterCode(BackgroundCode(self._flat, write, self._plants.prepare()))
+        return BackgroundCode(self._flat, write, self._plants.prepare())
 
     # --- continuing ------------------------------------------------------------------------------------------------
 
@@ -241,8 +252,15 @@ class HybridTicks:
             self._hand_over(loop, found.t)
         if found.reason is HybridReason.LOOK:
             self._take_back(loop)
-            changes_method(self._workspace, self._continuous, found.t, *loop.take_sign())
+            self._choose_method(found.t, *loop.take_sign())
             self._hand_over(loop, found.t)
+
+    def _choose_method(self, t: float, sign: Sign, h: float) -> None:
+        """Decide, after a sign at steps of h in s, whether another method continues from t."""
+        continuous, workspace = self._continuous, self._workspace
+        continuous.stand_in(math.inf, math.inf)
+        x = workspace.here.x[continuous.where]
+        workspace.messages += continuous.method.decide(t, x, h, stuck=sign is Sign.STUCK)
 
     def _time_of(self, k: int) -> float:
         return float(k * self._flat.base)
@@ -309,20 +327,20 @@ class HybridTicks:
 
     def _hand_over(self, loop: CompiledHybrid, t: float) -> None:
         """Let C continue from an instant that Python has come to."""
-        continuous = self._continuous
+        continuous, method = self._continuous, self._continuous.method
         loop.begin(t)
         if self._handed is not None:
             self._handed.hand_over()
             loop.set_tolerances(methods_of(continuous))
-        loop.plan(planned_steps(continuous))
-        loop.active = active_method(continuous)
+        loop.plan([*method.planned.values()])
+        loop.active = method.names.index(method.active) if continuous.where.size else 0
         if continuous.domains is not None:
             loop.hand_over_domains(continuous.domains)
 
     def _take_back(self, loop: CompiledHybrid) -> None:
         """Let Python continue from where C has come to."""
-        continuous = self._continuous
-        restore_plans(continuous, loop.planned)
+        continuous, method = self._continuous, self._continuous.method
+        method.planned = dict(zip(method.names, loop.planned, strict=True))
         if self._handed is not None and self._handed.take_back():
             continuous.follow()
         if continuous.domains is not None:
@@ -332,7 +350,8 @@ class HybridTicks:
         """Report what has happened in C: events that have fired, and those of blocks in model exchange."""
         loop, continuous = self._loop, self._continuous
         assert loop is not None
-        report_fired(continuous, loop.take_fired())
+        for fired in loop.take_fired():
+            continuous.report_event(fired.t, fired.event, fired.before, fired.after)
         if self._handed is not None:
             self._handed.report()
         for t, event in () if loop.watch is None else loop.watch.take_slid():
@@ -353,35 +372,3 @@ def find_code(
 def is_stiff(continuous: Continuous) -> bool:
     """Whether the solver needs the derivative of the rates."""
     return any(METHODS[method.name].uses_slope for method in methods_of(continuous))
-
-
-def make_hybrid(
-    workspace: Workspace,
-    continuous: Continuous,
-    plants: PlantsInC,
-    stops: Sequence[int],
-    *,
-    every: bool,
-    machine: bool = False,
-    fuse: bool = False,
-) -> tuple[HybridTicks | None, tuple[str, ...]]:
-    """Return the ticks of a run with continuous states in C, None where they can't be had, and messages about them.
-
-    ``machine``: let the virtual machine evaluate the functions; then nothing is said but that the library can't be had.
-    """
-
-    def make() -> HybridTicks:
-        return HybridTicks(workspace, continuous, plants, stops, every=every, machine=machine, fuse=fuse)
-
-    def messages(made: HybridTicks) -> tuple[str, ...]:
-        compiled = (
-            f"Compiled: {describe_methods(methods_of(continuous), continuous.method.name)}, by the same rules as "
-            "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
-        )
-        fused = (
-            "Fused: ticks and rates are compiled for this processor; values differ by rounding, which some motions "
-            "magnify."
-        )
-        return *((compiled,) if continuous.where.size else ()), *((fused,) if fuse else ())
-
-    return make_in_c(None if machine else find_code_obstacle(workspace.flat), make, messages, machine=machine)

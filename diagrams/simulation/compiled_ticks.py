@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import CompilerError, LoopwrightError, SimulationError
+from ...blocks.core import LoopwrightError, SimulationError
 from ...fmus.calls import FmuInstance
 from ..compiled import (
     BackgroundCode,
-    Code,
     CompiledLoop,
     FusedPlant,
     Outcome,
@@ -24,7 +23,6 @@ from ..compiled import (
     bind_call,
     compile_fused,
     compile_ticks,
-    find_obstacle,
     interpret_ticks,
     write_ticks,
 )
@@ -63,9 +61,6 @@ _LOOPS = (
     "than an interpreted run, so that its values may differ by some 1e-14 times the condition of these equations."
 )
 
-Made = TypeVar("Made")
-"""Ticks in C: `CompiledTicks`, or those with continuous states between them."""
-
 
 @dataclass(frozen=True, eq=False)
 class _Window:
@@ -98,11 +93,16 @@ class CompiledTicks:
         stops: Sequence[int],  # entries of the log that end the run where they are true
         *,
         every: bool,  # visit every tick, not only those at which a subsystem acts
-        code: TickCode | None = None,
+        machine: bool = False,  # the virtual machine evaluates the functions, and no compiler is needed
+        fuse: bool = False,  # compile ticks and plants of our own together, for the processor of this machine
     ):
         flat = self._flat = workspace.flat
         self._workspace, self._plants, self._every, self._stops = workspace, plants, every, stops
-        self._code = compile_ticks(flat, kinds_of(flat, every=every)) if code is None else code
+        acting = kinds_of(flat, every=every)
+        if machine:
+            self._code = interpret_ticks(flat, acting)
+        else:
+            self._code = _fuse(flat, plants, acting) if fuse else compile_ticks(flat, acting)
         self._loop: CompiledLoop | None = None
         self._recorder: Recorder | None = None
         self._numbers = {clocks: kind for kind, clocks in enumerate(self._code.ticks)}
@@ -123,10 +123,10 @@ class CompiledTicks:
         """Let generated code of the same ticks continue; C must not run meanwhile."""
         self._code, self._loop = code, None
 
-    def make_later(self) -> LaterCode[TickCode]:
+    def make_later(self) -> BackgroundCode[TickCode]:
         """Return generated code of these ticks that is made while they are interpreted."""
         write = partial(write_ticks, self._flat.origin, [*self._code.ticks])
-        return LaterCode(BackgroundCode(self._flat, write, self._plants.prepare()))
+        return BackgroundCode(self._flat, write, self._plants.prepare())
 
     def run(
         self,
@@ -252,57 +252,14 @@ def bind_evaluations(
         return {}
     try:
         code = find_code()
-    except LoopwrightError:  # as `make_compiled` says
+    except LoopwrightError:  # the start is then evaluated by Python; `Engine` reports the obstacle
         return {}
     results = [workspace.x_next, workspace.z, workspace.log, workspace.ok]
     vectors = [here.t, here.x, here.w, here.p]
     return {clocks: bind_call(tick, vectors, results) for clocks, tick in code.ticks.items()} if code.exact else {}
 
 
-def make_compiled(
-    workspace: Workspace,
-    plants: PlantsInC,
-    stops: Sequence[int],
-    *,
-    every: bool,
-    machine: bool = False,
-    fuse: bool = False,
-) -> tuple[CompiledTicks | None, tuple[str, ...]]:
-    """Return the ticks of a run in C, None where they can't be had, and messages about them.
-
-    ``machine``: let the virtual machine evaluate them; then nothing is said where they can't be had.
-    ``fuse``: compile ticks and plants of our own together, for the processor of this machine.
-    """
-    flat = workspace.flat
-
-    def make() -> CompiledTicks:
-        code = _fuse(flat, plants, every=every) if fuse else None
-        code = interpret_ticks(flat, kinds_of(flat, every=every)) if machine else code
-        return CompiledTicks(workspace, plants, stops, every=every, code=code)
-
-    return make_in_c(None if machine else find_obstacle(flat), make, lambda made: made.messages, machine=machine)
-
-
-def make_in_c(
-    obstacle: str | None, make: Callable[[], Made], messages: Callable[[Made], tuple[str, ...]], *, machine: bool
-) -> tuple[Made | None, tuple[str, ...]]:
-    """Return what ``make`` makes, and its messages; None and a message where there can't be generated code.
-
-    For the virtual machine there is nothing to say; that its library can't be had is an error.
-    """
-    if obstacle is None:
-        try:
-            made = make()
-        except CompilerError as error:
-            if machine:
-                raise
-            obstacle = str(error)
-        else:
-            return made, () if machine else messages(made)
-    return None, (f"Interpreted, though compile=True asks for C: {obstacle.rstrip('.')}.",)
-
-
-def _fuse(flat: FlatDiagram, plants: PlantsInC, *, every: bool) -> TickCode:
+def _fuse(flat: FlatDiagram, plants: PlantsInC, acting: Sequence[frozenset[TickPattern]]) -> TickCode:
     from ...fmus.running import Fmu  # only such a run needs the block
 
     found = {}
@@ -316,7 +273,7 @@ def _fuse(flat: FlatDiagram, plants: PlantsInC, *, every: bool) -> TickCode:
         file = block.description.file if _is_plain(block) else None
         to, of = (() if ports is None else ports.read_references() for ports in (step.inputs, step.outputs))
         found[path] = FusedPlant(file, to, of)
-    return compile_fused(flat, kinds_of(flat, every=every), found)
+    return compile_fused(flat, acting, found)
 
 
 def _is_plain(block: Fmu) -> bool:
@@ -325,26 +282,3 @@ def _is_plain(block: Fmu) -> bool:
     integrator = block.start.get("integrator", None if declared is None else declared.start)
     ports = [*block.input_variables.values(), *block.output_variables.values()]
     return integrator == _RK4 and all(v.causality in ("input", "output") for v in ports)
-
-
-@dataclass(frozen=True, eq=False)
-class LaterCode(Generic[Code]):
-    """Generated code that takes over from an interpreted run: to the last bit it makes no difference when."""
-
-    background: BackgroundCode[Code]
-
-    def report_failure(self) -> tuple[str, ...]:
-        """Return a message that there is no compiler, or one that fails; once in a process."""
-        return () if self.background.failure is None else report_failure_once(self.background.failure)
-
-
-_REPORTED: list[Exception] = []  # the failure that this process has reported
-
-
-def report_failure_once(failure: Exception) -> tuple[str, ...]:
-    """Return a message that there is no compiler, or one that fails; once in a process."""
-    if _REPORTED:
-        return ()
-    _REPORTED.append(failure)
-    text = "Interpreted, though the run is long enough for C: {}. compile=False asks for no compiler."
-    return (text.format(str(failure).rstrip(".")),)

@@ -8,18 +8,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, SimulationError, UnknownNameError, near
+from ...blocks.core import Block, CompilerError, SimulationError, UnknownNameError, near
 from ...fmus.calls import FmuInstance
+from ..compiled import TickCode, compile_ticks, find_code_obstacle, find_obstacle, interpret_ticks
 from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_model_exchange, to_coupling
 from ..flat import FlatDiagram, kinds_of
 from ..model_exchange import BlocksInModelExchange, ModelExchangeBlock
 from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
 from .change_over import ChangeOver
+from .compiled_hybrid import HybridTicks, find_code
+from .compiled_plants import PlantsInC
+from .compiled_ticks import CompiledTicks, bind_evaluations
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
 from .failed_blocks import opaque_failure
@@ -32,12 +36,6 @@ from .view import Position, SimulationView
 from .workspace import Workspace
 
 Progress = Callable[[float], Any]
-
-if TYPE_CHECKING:
-    from ..compiled import TickCode
-    from .compiled_hybrid import HybridTicks
-    from .compiled_plants import PlantsInC
-    from .compiled_ticks import CompiledTicks
 
 
 class Engine:
@@ -139,8 +137,6 @@ class Engine:
         large, sampled = self.flat.by_block, self.continuous is None
         plain = sampled and large if self._fuse else sampled or large
         if (plain and self._compile is True) or large:
-            from .compiled_ticks import bind_evaluations
-
             self.workspace.native = bind_evaluations(self.workspace, self._find_tick_code)
         self._find_start(choose_start_values(self.workspace))
         if self._compile is True:
@@ -148,9 +144,6 @@ class Engine:
 
     def _find_tick_code(self) -> TickCode:
         """Return the code of the ticks, for an evaluation of one."""
-        from ..compiled import compile_ticks, interpret_ticks
-        from .compiled_hybrid import find_code
-
         machine = self._compile is not True
         if self.continuous is not None:
             return find_code(self.flat, self.continuous, every=self.every_tick, machine=machine).ticks
@@ -196,24 +189,30 @@ class Engine:
 
     def _make_compiled(self, *, machine: bool) -> None:
         """Make the loop in C, with generated code or the virtual machine; a message says where code can't be had."""
-        from .compiled_hybrid import make_hybrid
-        from .compiled_ticks import make_compiled
-
-        plants, stops = self._plants_in_c(), self._stops.entries
-        found: CompiledTicks | HybridTicks | None
+        plants, stops, continuous = self._plants_in_c(), self._stops.entries, self.continuous
         options = {"every": self.every_tick, "machine": machine, "fuse": self._fuse}
-        if self.continuous is None:
-            found, message = make_compiled(self.workspace, plants, stops, **options)
-        else:
-            found, message = make_hybrid(self.workspace, self.continuous, plants, stops, **options)
-            if self._part is not None:
-                self._part.go_between = None if found is None else found.go_between
-        self.messages += message
+        find = find_obstacle if continuous is None else find_code_obstacle
+        obstacle = None if machine else find(self.flat)
+        found: CompiledTicks | HybridTicks | None = None
+        if obstacle is None:
+            try:
+                if continuous is None:
+                    found = CompiledTicks(self.workspace, plants, stops, **options)
+                else:
+                    found = HybridTicks(self.workspace, continuous, plants, stops, **options)
+            except CompilerError as error:
+                if machine:  # the library of the virtual machine can't be had
+                    raise
+                obstacle = str(error)
+        if self._part is not None and isinstance(found, HybridTicks):
+            self._part.go_between = found.go_between
         self._compiled, self._generated = found, found is not None and not machine
+        if found is not None and not machine:
+            self.messages += found.messages
+        if obstacle is not None:
+            self.messages += (f"Interpreted, though compile=True asks for C: {obstacle.rstrip('.')}.",)
 
     def _plants_in_c(self) -> PlantsInC:
-        from .compiled_plants import PlantsInC
-
         if self._in_c is None:
             self._in_c = PlantsInC(self.flat, self.plants, self.steps, self.coupled)
         return self._in_c
@@ -226,8 +225,6 @@ class Engine:
         return self._compiled
 
     def _hybrid_ticks(self) -> HybridTicks:
-        from .compiled_hybrid import HybridTicks
-
         found = self._ticks()
         assert isinstance(found, HybridTicks)
         return found
