@@ -47,7 +47,7 @@ def eager(monkeypatch):
         monkeypatch.setattr(background, name, 0.0)
     monkeypatch.setattr(background, "_LEAST", -1.0)
     monkeypatch.setattr(background, "Thread", AtOnce)
-    monkeypatch.setattr(compiled_ticks, "_REPORTED", [])
+    monkeypatch.setattr(change_over, "_REPORTED", [])
     begun, hand_over = [], compiled_ticks.CompiledTicks.hand_over
 
     def watched(self, code):

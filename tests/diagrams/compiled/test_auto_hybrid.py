@@ -19,7 +19,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, Run, subsystem
 from loopwright.diagrams.compiled import background, compiled_libraries
-from loopwright.diagrams.simulation import change_over, compiled_ticks
+from loopwright.diagrams.simulation import change_over
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
 
@@ -63,7 +63,7 @@ def eager(monkeypatch):
         monkeypatch.setattr(background, name, 0.0)
     monkeypatch.setattr(background, "_LEAST", -1.0)
     monkeypatch.setattr(background, "Thread", AtOnce)
-    monkeypatch.setattr(compiled_ticks, "_REPORTED", [])
+    monkeypatch.setattr(change_over, "_REPORTED", [])
 
 
 def test_many_ticks_are_those_of_the_matrix_exponential(eager):
