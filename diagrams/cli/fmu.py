@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
-import math
 import pkgutil
 import sys
 from collections import Counter
@@ -28,6 +27,7 @@ from ...fmus.models import gantry
 from ...fmus.platform import native_platform
 from ...fmus.toolchain import TARGETS
 from ..exporting import name_of
+from .diagrams import parse_positive
 from .doctor import add_doctor, run_doctor
 from .ssp import inspect_ssp
 from .subjects import is_ssp
@@ -64,10 +64,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     build.add_argument(
         "--integrator", choices=("rk4", "dopri5", "rodas"), help="fixed step, adaptive, or implicit (default: rk4)"
     )
-    build.add_argument("--tolerance", type=_parse_positive, help="relative tolerance of dopri5 and rodas")
-    build.add_argument(
-        "--internal-step", type=_parse_positive, metavar="S", help="longest step of the integrator, in s"
-    )
+    build.add_argument("--tolerance", type=parse_positive, help="relative tolerance of dopri5 and rodas")
+    build.add_argument("--internal-step", type=parse_positive, metavar="S", help="longest step of the integrator, in s")
     build.add_argument("--subsystem", metavar="PATH", help="export this subsystem of a diagram")
     build.add_argument(
         "--outside", nargs="+", action="extend", metavar="BLOCK", help="leave out these blocks of a diagram: the plant"
@@ -116,16 +114,6 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     check.add_argument("--no-run", action="store_true", help="don't run it: an FMU is a program of its maker's")
     add_json(check, "the problems, and what was checked,")
     add_doctor(commands)
-
-
-def _parse_positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"found {text!r}; expected a positive number")
-    return value
 
 
 def _complain(error: object) -> int:

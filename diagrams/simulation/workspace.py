@@ -46,7 +46,6 @@ class Workspace:
         """0 where a value was not finite or a guard failed."""
         self.looped = bool(flat.loops.slices)
         self._evaluations: dict[frozenset[TickPattern], Callable[[], None]] = {}
-        self._ticks: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._kept: list[Bound] = []
         self.native: Mapping[frozenset[TickPattern], Callable[[], None]] = {}
         """Evaluations of ticks at ``here`` that need no traced function of the whole diagram, by the acting clocks."""
@@ -97,21 +96,9 @@ class Workspace:
 
     def tick(self, acting: frozenset[TickPattern] = NONE) -> None:
         """Go through a tick at ``here``: evaluate everything, `check` it, and take over the next states."""
-        self.bind_tick(acting)()
-
-    def bind_tick(self, acting: frozenset[TickPattern]) -> Callable[[], None]:
-        """Return `tick` for some clocks as a call without arguments, for a loop over many ticks."""
-        if acting not in self._ticks:
-            evaluate, ok, x, x_next = self._evaluation(acting), self.ok, self.here.x, self.x_next
-
-            def tick() -> None:
-                evaluate()
-                if not ok[0]:
-                    self.check(acting)
-                x[:] = x_next
-
-            self._ticks[acting] = tick
-        return self._ticks[acting]
+        self.evaluate(acting)
+        self.check(acting)
+        self.here.x[:] = self.x_next
 
     def _evaluation(self, acting: frozenset[TickPattern]) -> Callable[[], None]:
         if acting not in self._evaluations:

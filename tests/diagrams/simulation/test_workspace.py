@@ -52,7 +52,7 @@ def test_a_tick_takes_over_the_next_states_and_an_evaluation_does_not(workspace)
         assert workspace.x_next.tolist() == [1.0]
     workspace.tick(acting)
     assert workspace.here.x.tolist() == [1.0]
-    workspace.bind_tick(acting)()
+    workspace.tick(acting)
     assert workspace.here.x.tolist() == [2.0]
     assert entry(workspace) == 1.0
 
