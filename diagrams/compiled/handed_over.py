@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError
-from ...fmus.calls import ModelExchangeInstance
+from ...fmus.calls import WARNING, ModelExchangeInstance
 from ..flat import JUMP, FlatDiagram, OpaqueStage
 from ..model_exchange import OWN_EVENTS, ModelExchangeEvaluator
 from .staged import NativeModelExchange, OwnEvent
@@ -90,7 +90,7 @@ class HandedOver:
         block, state = self._blocks[path], self.native.state_of(path)
         self.native.hand_over(
             path,
-            self.native.inputs_of(path) if state.by_python else block.reached_inputs,
+            self.native.inputs_of(path) if state.by_python else block.u,
             block.next_time,
             asks=self._evaluators[path].wants_event,
             ended=block.ends_run,
@@ -112,7 +112,7 @@ class HandedOver:
             return changed
         self._evaluators[path].wants_event = bool(state.asks)
         if state.ended and not block.ends_run:
-            block.take_end(state.end, in_event=bool(state.in_event))
+            block.note_end(state.end, in_event=bool(state.in_event))
         block.take_back(self.native.inputs_of(path), state.next_time, read_nominals=changed)
         return changed
 
@@ -120,7 +120,7 @@ class HandedOver:
         """Report what has happened in C: warnings, and events of the blocks' own."""
         self.native.remote.take_messages()
         for path, action, t in self.native.take_warnings():
-            self._blocks[path].take_warning(action, t)
+            self._blocks[path].judge(action, WARNING, t)
         for event in self.native.take_events():
             self._report(event)
 

@@ -37,17 +37,11 @@ Log = Callable[[int, str], None]
 C = TypeVar("C")
 
 
-def call_error_type() -> type[Exception]:
+def call_error_type() -> Any:
     """Return FMPy's class of errors of functions that fail."""
     from fmpy.fmi1 import FMICallException
 
-    return FMICallException  # type: ignore[no-any-return]
-
-
-def call_error(function: str, status: int) -> Exception:
-    """Return FMPy's error of a function that has failed."""
-    error: Any = call_error_type()
-    return error(function=function, status=ctypes.c_int(status).value)  # type: ignore[no-any-return]
+    return FMICallException
 
 
 def make_callbacks(prefix: str, log: Log) -> tuple[Any, Any]:
@@ -261,8 +255,10 @@ class FmiCalls(ABC):
 
     def get_texts(self, references: Sequence[int], size: int) -> list[str]:
         """Return the elements of variables that are texts."""
-        values = (ctypes.c_char_p * size)()
-        self._call_with_values("GetString", references, size, values)
+        values, kept = (ctypes.c_char_p * size)(), (ctypes.c_uint * len(references))(*references)
+        sizes = (size,) if self.table.has_sizes else ()
+        get = getattr(self.fmu, f"{self.prefix}GetString")
+        get(self.fmu.component, kept, len(references), values, *sizes)
         return [(value or b"").decode(errors="replace") for value in values]
 
     def set_texts(self, references: Sequence[int], values: Sequence[str]) -> None:
@@ -276,12 +272,6 @@ class FmiCalls(ABC):
     def set_binaries(self, references: Sequence[int], values: Sequence[bytes]) -> None:
         """Set the elements of variables that are binary data; only FMI 3.0 has them."""
         self.fmu.setBinary(list(references), list(values))
-
-    def _call_with_values(self, name: str, references: Sequence[int], size: int, values: Any) -> None:
-        """Call a function of FMPy's object that takes references and values."""
-        kept = (ctypes.c_uint * len(references))(*references)
-        sizes = (size,) if self.table.has_sizes else ()
-        getattr(self.fmu, f"{self.prefix}{name}")(self.fmu.component, kept, len(references), values, *sizes)
 
     def enter_configuration_mode(self) -> None:
         """Enter Configuration Mode, in which structural parameters are set (FMI 3.0, 2.3.4)."""
@@ -410,7 +400,7 @@ class FmiCalls(ABC):
             if ends:
                 return True
             if status > WARNING:
-                raise call_error(f"{self.prefix}DoStep", status)
+                raise call_error_type()(function=f"{self.prefix}DoStep", status=ctypes.c_int(status).value)
             event, terminate, early, _ = call.flags
             if event and self.event_mode_used and not terminate:
                 self.enter_event_mode()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
 
@@ -61,15 +61,15 @@ class ModelExchangeInstance(RunningFmu):
         self._is_own = self.fmi.in_process and self.is_built_here
         self._guarded = self.fmi.in_process and not self._is_own
         self._discarded = ""
-        self._u = np.zeros(0)
+        self.u = np.zeros(0)
         """Values of all inputs at the last instant that was reached."""
         self.next_time, self.nominals, self._has_odd_nominals = math.inf, np.ones(n), False
         self._events = self.fmi.event_calls()
-        self._event: Evaluation | None = None
-        self._completion: Evaluation | None = None
         self._bound: dict[tuple[str, int], BoundCalls] = {}
-        self._all_inputs: Transfer | None = None
-        self._final = True
+        self._wired_at = self._index(self.inputs)
+        self._discrete_at = self._index(port for port in self.inputs if port not in self._smooth)
+        self.is_final = True
+        """Whether no earlier state will be restored."""
         self._limited = any(np.isfinite(side).any() for v in self.inputs.values() for side in v.limits)
         width = sum(v.size for v in self._ports.values())
         self._least, self._relative = np.full(width, math.inf), np.zeros(width)
@@ -83,6 +83,10 @@ class ModelExchangeInstance(RunningFmu):
     def t(self) -> float:
         """Time that was set last, in s."""
         return self._time.value if self._running else self._began
+
+    def _index(self, ports: Iterable[str]) -> np.ndarray:
+        """Return the places of some ports among all inputs."""
+        return np.concatenate([np.zeros(0, int), *(np.r_[self._places[port]] for port in ports)])
 
     def _allocate(self, n: int) -> np.ndarray:
         return self.fmi.allocate(n, ctypes.c_double)
@@ -110,7 +114,6 @@ class ModelExchangeInstance(RunningFmu):
         outputs = {port: self.block.output_variables[port] for port in wanted.outputs}
         every = wanted.indicators or bool(then) or all_inputs
         used = {port: v for port, v in self._smooth.items() if every or self._is_needed(port, wanted)}
-        index = [np.arange(self._places[p].start, self._places[p].stop) for p in used]
         inputs = self._allocate(sum(v.size for v in used.values()))
         got = self._allocate(sum(v.size for v in outputs.values()))
         return Evaluation(
@@ -118,7 +121,7 @@ class ModelExchangeInstance(RunningFmu):
             time=self._time,
             states=Vector("set_states", self._x),
             inputs=Transfer(self.fmi, "Set", used, inputs),
-            index=np.concatenate([np.zeros(0, dtype=int), *index]),
+            index=self._index(used),
             outputs=Transfer(self.fmi, "Get", outputs, got),
             derivatives=Vector("derivatives", self._dx),
             rates=wanted.rates,
@@ -226,7 +229,7 @@ class ModelExchangeInstance(RunningFmu):
 
     def exchange(self, u: np.ndarray) -> np.ndarray:
         """In Initialization Mode: set the inputs, and return the continuous states that follow."""
-        self._u = u.copy()
+        self.u = u.copy()
         status = self._fill(u, self._began).set() if self.inputs else 0
         self.judge("setting the inputs", status, self._began)
         return self._get("get_states")
@@ -234,7 +237,7 @@ class ModelExchangeInstance(RunningFmu):
     def begin_exchange(self) -> np.ndarray:
         """Leave Initialization Mode, settle the events at the start, and return the continuous states."""
         if self._limited:
-            self.check_limits(self._fill(self._u, self._began), self._began)
+            self.check_limits(self._fill(self.u, self._began), self._began)
         self.begin()
         self._time.value = self._began
         x = self._iterate(self._began, self.fmi.initialized)
@@ -244,7 +247,7 @@ class ModelExchangeInstance(RunningFmu):
         def evaluation(wanted: Wanted) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
             return partial(self._run, self._bind(wanted, all_inputs=True))
 
-        check_structure(self, self.about, self._places, evaluation, self._began, x, self._u)
+        check_structure(self, self.about, self._places, evaluation, self._began, x, self.u)
         return x
 
     def _read_nominals(self) -> np.ndarray:
@@ -280,17 +283,17 @@ class ModelExchangeInstance(RunningFmu):
             bound = self._bound[quantity, len(calls)] = self.fmi.bind(calls) if calls else BoundCalls(())
         return bound
 
+    @cached_property
+    def _all_inputs(self) -> Transfer:
+        vector = self._allocate(self._wired_at.size)
+        return Transfer(self.fmi, "Set", self.inputs, vector)
+
     def _fill(self, u: np.ndarray, t: float) -> Transfer:
         """Return the transfer of all wired inputs, discrete ones too, with their values."""
-        if self._all_inputs is None:
-            vector = self._allocate(sum(v.size for v in self.inputs.values()))
-            self._all_inputs = Transfer(self.fmi, "Set", self.inputs, vector)
         inputs = self._all_inputs
-        if self.inputs:
-            inputs.vector[:] = np.concatenate([u[self._places[port]] for port in self.inputs])
+        inputs.vector[:] = u[self._wired_at]
         try:
-            for group in inputs.groups:
-                group.check_and_fill(inputs.vector)
+            inputs.fill()
         except UnfitError as error:
             raise self.refuse(error, t) from None
         return inputs
@@ -299,57 +302,51 @@ class ModelExchangeInstance(RunningFmu):
 
     def has_jumped(self, u: np.ndarray) -> bool:
         """Whether an input has jumped since the last instant that was reached."""
-        change = np.abs(u - self._u)
+        change = np.abs(u - self.u)
         return bool((change > np.maximum(self._least, self._relative * np.abs(u))).any())
 
     def handle_event(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Go through Event Mode at an instant, and return the continuous states after it."""
         inputs = self._fill(u, t)
         self.check_limits(inputs, t)
-        event = self._event_evaluation(inputs)
-        self._u, self._discarded = u.copy(), ""
-        self._run(event, t, x, u)
+        self.u, self._discarded = u.copy(), ""
+        self._run(self._event, t, x, u)
         self._check_computed(t)
         return self._iterate(t, self._events.answers.updated())
 
-    def _event_evaluation(self, inputs: Transfer) -> Evaluation:
-        """Return the calls that go into Event Mode, with all inputs, for a first round."""
-        if self._event is None:
-            calls = self._events
-            sets = [((group.function, group.arguments), "setting the inputs") for group in inputs.groups]
-            more = [*sets, (calls.update, _UPDATING)]
-            if calls.enter is not None:
-                more.insert(0, (calls.enter, "entering Event Mode"))
-            self._event = self._bind(Wanted(indicators=bool(self.about.indicators)), tuple(more))
-        return self._event
+    @cached_property
+    def _event(self) -> Evaluation:
+        """Calls that go into Event Mode, with all inputs, for a first round."""
+        enter, update = self._events.enter, self._events.update
+        more = [(call, "setting the inputs") for call in self._all_inputs.calls]
+        more = [*([] if enter is None else [(enter, "entering Event Mode")]), *more, (update, _UPDATING)]
+        return self._bind(Wanted(indicators=bool(self.about.indicators)), tuple(more))
 
-    def _step_evaluation(self) -> Evaluation:
-        """Return the calls that tell an accepted step of the solver."""
-        if self._completion is None:
-            self._completion = self._bind(Wanted(), ((self._events.complete, "completing a step"),))
-        return self._completion
+    @cached_property
+    def _completion(self) -> Evaluation:
+        """Calls by which the FMU learns of a step that the solver has accepted."""
+        return self._bind(Wanted(), ((self._events.complete, "completing a step"),))
 
     def _check_computed(self, t: float) -> None:
         """Refuse an instant that the solver has reached, and that the FMU can't compute."""
         if self._discarded:
             raise self.report(f"{self._discarded}, where the solver has arrived:", DISCARD, t)
 
-    def _bind_update(self) -> BoundCalls:
-        key = ("update", 1)
-        if key not in self._bound:
-            self._bound[key] = self.fmi.bind([self._events.update])
-        return self._bound[key]
+    @cached_property
+    def _update(self) -> BoundCalls:
+        """One more round of the event iteration."""
+        return self.fmi.bind([self._events.update])
 
     def _iterate(self, t: float, made: EventUpdate | None = None) -> np.ndarray:
         """Update the discrete states until they settle, and return to Continuous-Time Mode."""
         calls, nominals = self._events, False
         for _ in range(MOST_ROUNDS):
             if made is None:
-                self.judge(_UPDATING, self._bind_update().run(), t)
+                self.judge(_UPDATING, self._update.run(), t)
                 made = calls.answers.updated()
             nominals |= made.nominals_changed
             if made.terminate:
-                self._note_end(t, "in Event Mode")
+                self.note_end(t, in_event=True)
             if not made.again:
                 break
             made = None
@@ -375,29 +372,27 @@ class ModelExchangeInstance(RunningFmu):
         """Note an instant that the solver has reached; return whether the FMU wants an event there (step event)."""
         if self._limited:
             self.check_limits(self._fill(u, t), t)
-        discrete = [port for port in self.inputs if port not in self._smooth]
-        kept = {port: self._u[self._places[port]].copy() for port in discrete}
-        self._u, self._discarded = u.copy(), ""
-        changed = False
-        for port, values in kept.items():  # they are taken over by an event alone
-            changed |= not np.array_equal(values, u[self._places[port]])
-            self._u[self._places[port]] = values
+        discrete = self.u[self._discrete_at]  # they are taken over by an event alone
+        changed = not np.array_equal(discrete, u[self._discrete_at])
+        self.u, self._discarded = u.copy(), ""
+        self.u[self._discrete_at] = discrete
         if self.record.variables:
             self.evaluation(Wanted())(t, x, u)
             self.note_texts(t)
         if not self.about.completes_steps:
             return changed
-        completion = self._step_evaluation()
-        self._events.final.value = self._final
+        completion = self._completion
+        self._events.final.value = self.is_final
         self._run(completion, t, x, u)
         self._check_computed(t)
         wants, terminate = self._events.answers.completed()
         if terminate:
-            self._note_end(t, "after a step of the solver")
+            self.note_end(t, in_event=False)
         return wants or changed
 
-    def _note_end(self, t: float, place: str) -> None:
+    def note_end(self, t: float, *, in_event: bool) -> None:
         """Note that the FMU asks to end the simulation; it is reported once."""
+        place = "in Event Mode" if in_event else "after a step of the solver"
         if not self.ends_run:
             self.ends_run = True
             self.add_note(f"it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)")
@@ -412,13 +407,13 @@ class ModelExchangeInstance(RunningFmu):
     def serialize(self) -> bytes:
         """Return its complete state."""
         self._check_can()
-        self._final = False
+        self.is_final = False
         handle = self.call("saving its state", self.fmi.save_state)
         try:
             data = self.call("serializing its state", self.fmi.serialize_state, handle)
         finally:
             self.free_state(handle)
-        data = self._u.astype("<f8").tobytes() + bytes(data)
+        data = self.u.astype("<f8").tobytes() + bytes(data)
         return _FORMAT.pack(self.description.digest, self.t, self.next_time, data=data)
 
     def restore_bytes(self, data: bytes) -> None:
@@ -432,8 +427,8 @@ class ModelExchangeInstance(RunningFmu):
             self.call("restoring its state", self.fmi.set_state, handle)
         finally:
             self.free_state(handle)
-        self.failed, self._running, self._final, self.ends_run = False, True, False, False
-        self._u, self.next_time, self._time.value = u, next_time, t
+        self.failed, self._running, self.is_final, self.ends_run = False, True, False, False
+        self.u, self.next_time, self._time.value = u, next_time, t
 
     def _check_can(self) -> None:
         if self.can_serialize:
@@ -450,7 +445,7 @@ class ModelExchangeInstance(RunningFmu):
     def report(self, action: str, status: int, t: float) -> FmuRuntimeError:
         """Return the error of an action that has failed with a status."""
         self.failed, self.fatal = status >= ERROR, status >= FATAL
-        u = ", ".join(f"{port} = {self._u[self._places[port]].tolist()}" for port in self.inputs)
+        u = ", ".join(f"{port} = {self.u[self._places[port]].tolist()}" for port in self.inputs)
         return FmuRuntimeError(
             f"{action} failed with {self.fmi.status_name(status)} at t = {t:.9g} s{self._quote_messages()} Its states "
             f"were {self._x.tolist()}, its inputs at the last step {u or 'none'}. Look at the last samples of "
@@ -463,7 +458,7 @@ class ModelExchangeInstance(RunningFmu):
 
     def find_native_obstacle(self) -> str | None:
         """Return why a loop in C can't evaluate it; None if it can."""
-        if not self.fmi.in_process and self._bind_update().request is None:
+        if not self.fmi.in_process and self._update.request is None:
             return "runs in its own process, for which C can't wait on this system"
         if self.record.variables:
             return "has outputs of texts, which are recorded at each step"
@@ -479,23 +474,21 @@ class ModelExchangeInstance(RunningFmu):
 
     def native_look(self, vectors: EvaluationVectors) -> NativeLook:
         """Return `accept` and `handle_event` as actions of C, at what is in t, x and u; states are written."""
-        inputs, take = self._fill(self._u, self.t), ActionKind.TAKE
+        inputs, take = self._fill(self.u, self.t), ActionKind.TAKE
         u, without_result = vectors.u, vectors._replace(into=np.zeros(0))
-        index = np.concatenate([np.zeros(0, int), *(np.arange(s.start, s.stop) for s in map(self._place, self.inputs))])
-        enter = [*transfer_actions(inputs, u, index, take)]
-        enter += self._event_evaluation(inputs).native(without_result, self._order)
-        complete = self._step_evaluation().native(without_result, self._order) if self.about.completes_steps else []
+        enter = [*transfer_actions(inputs, u, self._wired_at, take)]
+        enter += self._event.native(without_result, self._order)
+        complete = self._completion.native(without_result, self._order) if self.about.completes_steps else []
         calls = self._events
         states = self._bind_reading("get_states", *([] if calls.leave is None else [calls.leave]))
         leave = call_actions(states, [_READING["get_states"]] * len(states.calls))
         low, high, discrete = np.full(u.size, -math.inf), np.full(u.size, math.inf), np.zeros(u.size, dtype=bool)
-        low[index], high[index] = inputs.limits
-        for port in self.inputs:
-            discrete[self._places[port]] = port not in self._smooth
+        low[self._wired_at], high[self._wired_at] = inputs.limits
+        discrete[self._discrete_at] = True
         return NativeLook(
             complete,
             enter,
-            call_actions(self._bind_update(), [_UPDATING]),
+            call_actions(self._update, [_UPDATING]),
             [*leave, *copy_action(ActionKind.GIVE, vectors.into, self._order, self._kept)],
             calls.answers,
             None if self.fmi.in_process and calls.leave is not None else calls.final,
@@ -506,37 +499,16 @@ class ModelExchangeInstance(RunningFmu):
             high,
         )
 
-    def _place(self, port: str) -> slice:
-        return self._places[port]
-
     @property
     def native_host(self) -> HostState | None:
         """The state of this process, which a library that Loopwright has not built may change."""
         return self.host if self._guarded else None
 
-    @property
-    def is_final(self) -> bool:
-        """Whether no earlier state will be restored."""
-        return self._final
-
-    @property
-    def reached_inputs(self) -> np.ndarray:
-        """Values of all inputs at the last instant that was reached."""
-        return self._u
-
     def take_back(self, u: np.ndarray, next_time: float, *, read_nominals: bool) -> None:
         """Continue from where a loop in C has come to."""
-        self._u, self.next_time = u.copy(), next_time
+        self.u, self.next_time = u.copy(), next_time
         if read_nominals:
             self.nominals = self._read_nominals()
-
-    def take_end(self, t: float, *, in_event: bool) -> None:
-        """Note that the FMU has asked to end the simulation, to a loop in C."""
-        self._note_end(t, "in Event Mode" if in_event else "after a step of the solver")
-
-    def take_warning(self, action: str, t: float) -> None:
-        """Note a warning of the FMU, to a loop in C."""
-        self.log.warn(action, self.fmi.status_name(WARNING), t)
 
     def judge_native(self, action: str, status: int, t: float) -> None:
         """Raise the error of a call of C that has failed; without a status, of an event that has no end or no time."""

@@ -190,7 +190,8 @@ class InstanceStep:
         fmu.is_stepping = False
         if self.parts & _BY_PYTHON:
             self._taken[:] = np.concatenate([np.zeros(0), *(part.values for part in self._watched)])
-            self._until[0] = -math.inf if fmu.ends_run else self._next_instant
+            ahead = math.inf if self.events is None else self.events.next_instant
+            self._until[0] = -math.inf if fmu.ends_run else ahead
 
     def _judge_calls(self, status: int) -> int:
         """Note warnings of the calls of a step, or raise the error of one before it; return the status of the step."""
@@ -370,11 +371,6 @@ class InstanceStep:
             raise self.fmu.refuse(error, t) from None
 
     # ---- parts of a step ----
-
-    @property
-    def _next_instant(self) -> float:
-        """Time in s of the next event that is known ahead; infinite without one."""
-        return math.inf if self.events is None else self.events.next_instant
 
     def _next_stop(self, now: float, end: float) -> float:
         """Return where the next part of a step ends that is to go from now to its end."""

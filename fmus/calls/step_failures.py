@@ -80,15 +80,11 @@ class StepFailures(SavingFmu):
 
     # ---- failures of a step (FMI 2.0, 2.1.3 and 4.2.2; FMI 3.0, 2.2.3 and 4.2.1) ----
 
-    def _mark_failure(self, status: int) -> None:
-        self.failed = status >= ERROR  # a call that is discarded changes nothing
-        self.fatal = status >= FATAL
-
     def report(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
         """Return the error of an action that has failed with a status."""
         if self.ends_run:  # an FMU that has ended need not give its outputs any more
             return self.termination(self.now.value, self.width.value, t)
-        self._mark_failure(status)
+        self.failed, self.fatal = status >= ERROR, status >= FATAL  # a call that is discarded changes nothing
         return FmuRuntimeError(
             f"{action} failed with {self.fmi.status_name(status)}{self._quote_messages()} The inputs "
             f"({', '.join(v.name for v in self.inputs.values())}) were {self.vector.tolist()}. "

@@ -116,11 +116,12 @@ class StepOptions:
 
 def check_offered(options: StepOptions, about: FmuDescription, label: str) -> None:
     """Refuse options that an FMU does not offer."""
+    slopes = "providesIntermediateUpdate" if about.fmi.startswith("3") else "canInterpolateInputs"
     for name, offered, needed in (
         ("event_mode", about.has_event_mode, "hasEventMode is false in its description"),
         ("early_return", about.fmi.startswith("3"), f"only FMI 3.0 has that, and it is of FMI {about.fmi}"),
         ("rollback", about.can_save, f"{about.state_flags[0]} is false in its description"),
-        ("input_derivatives", about.interpolates_inputs, f"{_slopes_flag(about)} is not true in its description"),
+        ("input_derivatives", about.interpolates_inputs, f"{slopes} is not true in its description"),
     ):
         if getattr(options, name) and not offered:
             raise ParameterError(
@@ -147,7 +148,8 @@ class StepParts(Flag):
 
 def parts_of_step(about: FmuDescription, options: StepOptions) -> StepParts:
     """Return what belongs to the steps of an FMU."""
-    clocks = any(v.type_is_clock for v in about.other.values()) and not _ticks_by_itself(about)
+    # FMUs with clocks that Loopwright has exported make their ticks without Event Mode
+    clocks = any(v.type_is_clock for v in about.other.values()) and not about.generation_tool.startswith("Loopwright")
     events = about.has_event_mode and (clocks if options.event_mode is None else options.event_mode)
     chosen = {
         StepParts.EVENTS: events,
@@ -157,11 +159,6 @@ def parts_of_step(about: FmuDescription, options: StepOptions) -> StepParts:
         StepParts.ADDED_TIME: options.time is StepTime.ADDED,
     }
     return reduce(or_, (part for part, belongs in chosen.items() if belongs), StepParts(0))
-
-
-def _ticks_by_itself(about: FmuDescription) -> bool:
-    """Whether an FMU with clocks makes their ticks without Event Mode: those that Loopwright has exported do."""
-    return about.generation_tool.startswith("Loopwright")
 
 
 def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> None:
@@ -174,7 +171,3 @@ def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> 
         fmi.intermediate_inputs = tuple(
             r for v in inputs if v.intermediate and v.type == "Float64" for r in v.references
         )
-
-
-def _slopes_flag(about: FmuDescription) -> str:
-    return "providesIntermediateUpdate" if about.fmi.startswith("3") else "canInterpolateInputs"

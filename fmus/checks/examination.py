@@ -26,7 +26,7 @@ from .diagnosis import FmuDiagnosis, FmuTrial, FmuVerdict
 from .exported_functions import missing_promises
 from .libraries import binaries_of, native_libraries, tuple_of
 from .summary import INTERFACES, summarize
-from .trial import FmuProblem, find_step, split_step, try_out
+from .trial import find_step, split_step, try_out
 from .validation import reason_not_to_run, validate
 
 _ABSENT = (FmuFault.NO_BINARY, FmuFault.OTHER_PLATFORM, FmuFault.VERSION, FmuFault.INTERFACE)
@@ -302,11 +302,7 @@ def _judge_rules(path: Path, archive: FmuArchive, known: list[FmuFinding]) -> li
             found.append(_as_error(error, path))
     seen = {a.fault for a in (*known, *found) if a.severity == FmuSeverity.ERROR}
     problems = validate(path, run=False, limits=archive.limits).problems
-    return [*found, *(_warning(problem) for problem in problems if problem.fault not in seen)]
-
-
-def _warning(problem: FmuProblem) -> FmuFinding:
-    return FmuFinding(problem.fault, problem.subject, problem.found, problem.step)
+    return [*found, *(FmuFinding(p.fault, p.subject, p.found, p.step) for p in problems if p.fault not in seen)]
 
 
 # --- the trial ------------------------------------------------------------------------------------------------------

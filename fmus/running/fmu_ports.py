@@ -36,7 +36,8 @@ def choose_ports(
         _check_chosen(description, chosen, label)
         chosen = _choose_joined(description, chosen, members, label)
     # an array is taken apart where one of its scalars is named
-    split = {description.elements[n][0] for n in (*names, *(chosen or ())) if _is_part(description, n)}
+    named, elements = (*names, *(chosen or ())), description.elements
+    split = {elements[n][0] for n in named if n in elements and n not in description.variables}
     split -= set(chosen or ())
     both: tuple[dict[str, FmuVariable], dict[str, FmuVariable]] = {}, {}
     known: list[str] = []
@@ -65,8 +66,9 @@ def choose_ports(
         if array := members.get(old, ""):
             joined = description.find(old)
             raise ParameterError(
-                f"found {old!r}, {_kind_of(joined)}, as an element of the port {description.joined[array]!r}; expected "
-                "an input or an output, or a variable that ports= names. Add it there.",
+                f"found {old!r}, a {joined.variability} {joined.causality}, as an element of the port "
+                f"{description.joined[array]!r}; expected an input or an output, or a variable that ports= names. "
+                "Add it there.",
                 block=label,
                 port="rename",
             )
@@ -99,14 +101,6 @@ def _choose_joined(
                 port="ports",
             )
     return tuple(dict.fromkeys(members.get(name, name) for name in own))
-
-
-def _kind_of(variable: FmuVariable) -> str:
-    return f"a {variable.variability} {variable.causality}"
-
-
-def _is_part(description: FmuDescription, name: str) -> bool:
-    return name in description.elements and name not in description.variables
 
 
 def _variables(description: FmuDescription, split: set[str]) -> Iterator[FmuVariable]:

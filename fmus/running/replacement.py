@@ -254,7 +254,11 @@ def _match_elements(
         known = _families(fitting, size)
         if len(fitting) == size and not known:
             known = [tuple(fitting)]
-        like = {n: (spare[n].unit, *_likeness(variables[n])) for n in fitting}
+        of = {n: variables[n] for n in fitting}
+        like = {
+            n: (spare[n].unit, v.type, v.causality, v.variability, v.clocks, tuple(v.items.items()))
+            for n, v in of.items()
+        }
         families[name] = [f for f in known if port.shape and len({like[n] for n in f}) == 1]
     found: dict[str, tuple[str, ...]] = {}
     ranked = sorted((-_alike(name, _common_part(f)), name, f) for name, known in families.items() for f in known)
@@ -292,10 +296,6 @@ def _common_part(names: Sequence[str]) -> str:
     """Return the letters that names have in common, place by place, without marks at their ends."""
     same = "".join(letters[0] for letters in zip(*names, strict=False) if len(set(letters)) == 1)
     return same.strip("_.[]() ")
-
-
-def _likeness(v: FmuVariable) -> tuple[object, ...]:
-    return v.type, v.causality, v.variability, v.clocks, tuple(v.items.items())
 
 
 def _fits(a: object, b: object, *, converts: bool) -> bool:

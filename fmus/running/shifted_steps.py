@@ -23,7 +23,7 @@ def take_shifted_steps(
     about = point.about
     names = [*point.states, *point.inputs]
     layout = about.layout(names)
-    moved = {n for n in names if any(np.any(_part_of(layout, n, shift)) for shift in shifts)}
+    moved = {n for n in names if any(np.any(np.concatenate(shift)[layout.slices[n]]) for shift in shifts)}
     for name in point.states:
         if about.find(name).initial != "exact":
             raise FmuError(
@@ -41,9 +41,3 @@ def take_shifted_steps(
             return instance.values(point.states), instance.values(point.outputs)
 
         return [step(at + np.concatenate(shift)) for shift in ((0.0 * at, np.zeros(0)), *shifts)]
-
-
-def _part_of(layout: Any, name: str, shift: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the part of a shift that belongs to a state or an input."""
-    part: np.ndarray = np.concatenate(shift)[layout.slices[name]]
-    return part
