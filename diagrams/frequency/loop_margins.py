@@ -307,9 +307,12 @@ class _LoopMarginFinder(MarginFinder[Margins]):
             return crossings
         return [*crossings[: SHOWN - 1], crossings[-1]]
 
+    def _is_end(self, omega: float) -> bool:
+        """Return whether a frequency is an end of the axis, which is known without an error."""
+        return omega in (0.0, np.inf) or omega == self.r.nyquist
+
     def _frequency(self, c: Crossing, how: str) -> Number:
-        ends = c.omega in (0.0, np.inf) or c.omega == self.r.nyquist
-        return Number(c.omega, "rad/s", 0.0 if ends else c.tolerance * c.omega, how)
+        return Number(c.omega, "rad/s", 0.0 if self._is_end(c.omega) else c.tolerance * c.omega, how)
 
     def _make_gain_crossover(self, c: Crossing) -> GainCrossover:
         how = self.by.confirm_crossing(c, -1 / c.L, "gain_crossover")
@@ -428,7 +431,8 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         for name, peak, (a, b) in (("ms", s, (1.0, 0.0)), ("mt", t, (0.0, 1.0))):
             how = self.by.confirm_peak(a, b, peak, name)
             found[name] = Number(peak.value, "1", peak.value * self._error(peak, t), how)
-            found[name + "_frequency"] = Number(peak.omega, "rad/s", *self._tolerate(peak, how))
+            error = 0.0 if self._is_end(peak.omega) else 1e-7 * peak.omega
+            found[name + "_frequency"] = Number(peak.omega, "rad/s", error, how)
         ms = found["ms"]
         found["modulus_margin"] = Number(1 / ms.value, "1", ms.tolerance / ms.value**2, ms.confirmed_by)
         how = self.by.confirm_peak(upper, lower, disk, "disk_margin")
@@ -440,10 +444,6 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         inside = 0 < peak.omega < np.inf and not any(a.omega == peak.omega for a in self.scan.features.axis_poles)
         end = max(1e-13, self.r.end_error) if np.isinf(peak.omega) else 1e-13
         return max(1e-12, (self.r.error(peak.omega) if inside else end) * 3 * (1 + t.value))
-
-    def _tolerate(self, peak: Peak, how: str) -> tuple[float, str]:
-        ends = peak.omega in (0.0, np.inf) or peak.omega == self.r.nyquist
-        return (0.0 if ends else 1e-7 * peak.omega), how
 
     def _find_bandwidth(self) -> Number:
         L = self.scan.ends()[0][1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from .poles_and_zeros import SIDES, Features
 from .scan_refine_confirm import refine_sign_change
 
 if TYPE_CHECKING:
+    from .delayed_realization import DelayedRealization
     from .realization import Realization
 
 Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -29,46 +30,6 @@ NARROWINGS = 12
 """Halvings of the steps in which they lie."""
 POLISHED = 20
 """Number of candidates of a peak that are refined."""
-
-
-class Response(Protocol):
-    """A loop with one channel that is scanned: a `Realization`, or one with delays."""
-
-    @property
-    def dt(self) -> float:
-        """Sample time in s, 0 of a continuous loop."""
-
-    @property
-    def nyquist(self) -> float:
-        """Highest frequency in rad/s."""
-
-    @property
-    def D(self) -> np.ndarray:  # noqa: N802 - as of a realization
-        """L at infinite frequency, shape (1, 1)."""
-
-    @property
-    def late(self) -> float:
-        """Delay in s by which L turns at most, not counting the turns that its poles and zeros make."""
-
-    @property
-    def settled(self) -> float:
-        """Frequency in rad/s from which L is what it is at infinite frequency, but turns without end; else infinite."""
-
-    @property
-    def end_error(self) -> float:
-        """Relative error of L at infinite frequency, as a limit of values beyond `settled`."""
-
-    def matrix(self, s: np.ndarray) -> np.ndarray:
-        """Return L at points, shape (points, 1, 1)."""
-
-    def response(self, omega: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """Return L and dL/dω at frequencies."""
-
-    def error(self, omega: float) -> float:
-        """Return an estimate of the relative error of L at a frequency."""
-
-    def rounding(self, s: np.ndarray) -> np.ndarray:
-        """Return a bound of the rounding error of L at points."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +161,7 @@ class _Search:
 class LoopScan:
     """Frequency response of a loop with one channel, sampled once; crossings and peaks are refined from the samples."""
 
-    def __init__(self, r: Response, features: Features | None = None, *, floor: float = 0.0):
+    def __init__(self, r: Realization | DelayedRealization, features: Features | None = None, *, floor: float = 0.0):
         self.r = r
         self.features = features if features is not None else Features.of(cast("Realization", r))
         self.floor = floor
@@ -360,7 +321,9 @@ class LoopScan:
         return float(np.exp(refine_sign_change(lambda x: function(np.exp(x)), low, high, xtol=1e-14)))
 
 
-def make_grid(r: Response, features: Features, *, delay: float = 0.0, floor: float = 0.0) -> list[np.ndarray]:
+def make_grid(
+    r: Realization | DelayedRealization, features: Features, *, delay: float = 0.0, floor: float = 0.0
+) -> list[np.ndarray]:
     """Return segments of frequencies in rad/s that resolve every pole and zero, cut at those on the axis.
 
     The grid has 40 points a decade, and more around each pole and zero in proportion to its distance from the axis. It
@@ -395,7 +358,7 @@ def make_grid(r: Response, features: Features, *, delay: float = 0.0, floor: flo
     return segments
 
 
-def _leave_small(r: Response, segments: list[np.ndarray], size: float) -> list[np.ndarray]:
+def _leave_small(r: Realization | DelayedRealization, segments: list[np.ndarray], size: float) -> list[np.ndarray]:
     """Return segments without the frequencies behind the last at which |L| is above a size, and one more."""
     last = [np.flatnonzero(np.abs(r.matrix(1j * omega)[:, 0, 0]) > size) for omega in segments]
     most = max((k for k, found in enumerate(last) if found.size), default=0)
@@ -403,7 +366,7 @@ def _leave_small(r: Response, segments: list[np.ndarray], size: float) -> list[n
     return [*segments[:most], segments[most][:end]]
 
 
-def _bisect(r: Response, omega: np.ndarray, delay: float, floor: float) -> np.ndarray:
+def _bisect(r: Realization | DelayedRealization, omega: np.ndarray, delay: float, floor: float) -> np.ndarray:
     def respond(at: np.ndarray) -> np.ndarray:
         return np.asarray(r.matrix(1j * at)[:, 0, 0] * np.exp(-1j * at * delay))
 

@@ -15,8 +15,8 @@ GAP = 2e-9
 """Relative distance that a scan keeps from a single pole or zero on the axis."""
 
 
-class Plane(Protocol):
-    """The plane in which the poles of a realization are."""
+class Poles(Protocol):
+    """Poles of a `Realization`, or of one with delays: a protocol, as the latter imports this file."""
 
     @property
     def dt(self) -> float:
@@ -31,10 +31,6 @@ class Plane(Protocol):
 
     def logarithm(self, p: np.ndarray) -> np.ndarray:
         """Return s at points of the plane."""
-
-
-class HiddenPoles(Plane, Protocol):
-    """A realization from which hidden poles were removed."""
 
     @property
     def hidden(self) -> np.ndarray:
@@ -110,7 +106,7 @@ class Features:
 
 
 def split_axis_poles(
-    r: Plane, p: np.ndarray, scale: float, errors: np.ndarray | None = None
+    r: Poles, p: np.ndarray, scale: float, errors: np.ndarray | None = None
 ) -> tuple[tuple[AxisPole, ...], np.ndarray]:
     """Split poles into those on the limit of stability, with coinciding ones gathered, and the others, all as s.
 
@@ -186,7 +182,7 @@ def count_zeros_at_infinity(r: Realization) -> int:
     return r.order
 
 
-def find_hidden_unstable(r: HiddenPoles) -> tuple[complex, ...]:
+def find_hidden_unstable(r: Poles) -> tuple[complex, ...]:
     """Return the hidden poles beyond the limit, in the planes of s or z.
 
     Coinciding poles on the limit scatter to both sides and are left out.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
@@ -210,28 +211,25 @@ class Case:
         return (variant for variant in self.usable(*implementations) if variant.is_design)
 
     def _add(self, basis: Basis, implementation: Implementation, make: Callable[[], WiredDiagram], title: str) -> None:
-        def variant(diagram: WiredDiagram, where: Any) -> Variant:
-            return Variant(
-                implementation + basis.suffix,
-                title or AS_IT_IS,
-                diagram,
-                where,
-                implementation,
-                basis.is_design,
-                is_actual=not title,
-                source=self.diagram,
-                inputs=self.inputs,
-                outputs=self.outputs,
-                stairs=self.stairs,
-            )
-
-        found = variant(self.diagram, self.point)
+        found = Variant(
+            implementation + basis.suffix,
+            title or AS_IT_IS,
+            self.diagram,
+            self.point,
+            implementation,
+            basis.is_design,
+            is_actual=not title,
+            source=self.diagram,
+            inputs=self.inputs,
+            outputs=self.outputs,
+            stairs=self.stairs,
+        )
         try:
-            found = variant(cut_places(make(), tuple(self.loop_places.values())), self.point)
+            found = replace(found, diagram=cut_places(make(), tuple(self.loop_places.values())))
             if self.point is None and any(isinstance(f, UnusualStart) for f in found.model.findings):
-                found = variant(found.diagram, LATER * found.model.dt)
+                found = replace(found, where=LATER * found.model.dt)
             if found.model.delays is not None:
-                _ = found.model.poles  # the roots of a dead time that is very long beside the loop may not be had
+                _ = found.model.poles  # the roots of a dead time that is very long for the loop may not be had
         except LoopwrightError as error:
             sampled_only = implementation is Implementation.CONTINUOUS and isinstance(error, SampleTimeError)
             found.problem = TEXTS.line("sampled_only", block=error.block) if sampled_only else str(error)

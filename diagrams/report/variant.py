@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Any
@@ -78,35 +78,25 @@ class Cut(StrEnum):
 
 @dataclass(eq=False)
 class Variant:
-    """A diagram that is analysed: itself, without sampling, with a delay.
+    """A diagram that is analysed: itself, without sampling, with a delay."""
 
-    ``key``: its part of dotted paths, such as ``sampled_d0``.
-    ``where``: the operating point, or where it is looked for; the start without it.
-    ``implementation``: whether it is sampled, and delayed.
-    ``is_design``: whether it is the design itself. Other variants show what a real plant adds to it; they get margins,
-    but no figures, and python-control is not asked about them.
-    ``is_actual``: whether it is the diagram as it is, with nothing left out and nothing added.
-    ``problem``: why it can't be analysed; empty where it can.
-    ``source``: the diagram of an operating point that is taken over.
-    ``required``: wires and ports on which something is required: a motion that changes one of them is not free.
-    ``every_state``: whether free motions count as any other: the strict rule.
-    """
-
-    key: str
+    key: str  # its part of dotted paths, such as ``sampled_d0``
     title: str
     diagram: WiredDiagram
-    where: Any
+    where: Any  # the operating point, or where it is looked for; the start without it
     implementation: Implementation
+    # Others than the design show what a real plant adds to it; they get margins, but no figures, and python-control is
+    # not asked about them.
     is_design: bool = True
-    is_actual: bool = False
-    problem: str = ""
-    source: WiredDiagram | None = None
+    is_actual: bool = False  # whether it is the diagram as it is, with nothing left out and nothing added
+    problem: str = ""  # why it can't be analysed
+    source: WiredDiagram | None = None  # the diagram of an operating point that is taken over
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     stairs: str | None = None
-    required: tuple[str, ...] = ()
-    every_state: bool = False
-    _loops: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
+    required: tuple[str, ...] = ()  # wires and ports: a motion that changes one of them is not free
+    every_state: bool = False  # whether free motions count as any other: the strict rule
+    _loops: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def point(self) -> OperatingPoint:
@@ -233,21 +223,8 @@ class Variant:
 
     def with_parameters(self, changes: Mapping[str, Any], where: Any = ...) -> Variant:
         """Return the variant with other parameters, at its own operating point, or at another one."""
-        return Variant(
-            self.key,
-            self.title,
-            self.diagram.replace(changes),
-            self.where if where is ... else where,
-            self.implementation,
-            self.is_design,
-            self.is_actual,
-            source=self.source,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            stairs=self.stairs,
-            required=self.required,
-            every_state=self.every_state,
-        )
+        where = self.where if where is ... else where
+        return replace(self, diagram=self.diagram.replace(changes), where=where, problem="")
 
 
 def _has(flat: FlatDiagram, name: str) -> bool:

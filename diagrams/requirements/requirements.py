@@ -150,14 +150,10 @@ class LoopLimits:
 
     def __repr__(self) -> str:
         texts = [f"{name} {limit}" for name, limit in self.limits.items()]
-        steps = [repr(step) for step in self._all_steps()]
+        steps = [repr(step) for step in (self.step, *getattr(self, "steps", ())) if step is not None]
         loops = [f"{wire}: {limits!r}" for wire, limits in getattr(self, "loops", {}).items()]
         more = f"variants {', '.join(self.variants)}" if self.variants else ""
         return brief(self._kind, *texts, *steps, *loops, more, then=".limits, .step, .variants")
-
-    def _all_steps(self) -> list[StepLimits]:
-        """Return the limits of responses to steps: of that at a loop's own wire, and of others."""
-        return [*([] if self.step is None else [self.step]), *getattr(self, "steps", ())]
 
     _kind: ClassVar[str] = "limits of a loop"
 

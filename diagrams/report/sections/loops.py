@@ -261,14 +261,12 @@ def _numbers(m: Margins, L: Any) -> dict[str, Number]:
     of = "characteristic functions" if delayed else "eigenvalues"
     said = f"winding of 1 + L, and {of} of open and closed loop"
     found["encirclements"] = Number(m.encirclements, "1", 0.0, said)
-    kinds: tuple[tuple[str, tuple[Any, ...], str], ...] = (
-        ("gain_crossover", m.gain_crossovers, "phase_margin_deg"),
-        ("phase_crossover", m.phase_crossovers, "gain_margin"),
-    )
-    for kind, crossings, margin in kinds:
-        for i, c in enumerate(crossings, 1):
-            found[f"{kind}_{i}.frequency"] = c.frequency
-            found[f"{kind}_{i}.{margin}"] = getattr(c, margin)
+    for i, g in enumerate(m.gain_crossovers, 1):
+        found[f"gain_crossover_{i}.frequency"] = g.frequency
+        found[f"gain_crossover_{i}.phase_margin_deg"] = g.phase_margin_deg
+    for i, p in enumerate(m.phase_crossovers, 1):
+        found[f"phase_crossover_{i}.frequency"] = p.frequency
+        found[f"phase_crossover_{i}.gain_margin"] = p.gain_margin
     return found
 
 

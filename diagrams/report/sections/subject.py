@@ -138,9 +138,8 @@ def _fmu_parameters(block: Fmu) -> Any:
             yield name, _shown(np.asarray(value, dtype=float)), variable.unit or "", value
     for name in sorted(set(block.start) - set(block.description.of("parameter"))):
         yield f"start.{name}", _shown(block.start[name]), "", None
-    for name, value in (("rename", block.rename),):
-        if value:
-            yield name, _shown(value), "", None
+    if block.rename:
+        yield "rename", _shown(block.rename), "", None
 
 
 def _variants(case: Case) -> Table:

@@ -36,21 +36,6 @@ GROWING, GROWTH = "worst_growth", "growth of the fastest pole"
 """Key of the section, and the variant that its verdicts belong to."""
 
 
-def check_worst_case(diagram: WiredDiagram, found: Any) -> None:
-    """Check that a worst case is one of this diagram."""
-    if not isinstance(found, WorstCase):
-        raise OptionError(
-            f"found {found!r}; expected a worst case. Give diagram.worst_case(…), or a TOML file.", port="worst_case"
-        )
-    of = found.wired if found.given is None else found.given
-    if content_hash(of) != content_hash(diagram):
-        raise OptionError(
-            f"found a worst case of another diagram; expected one of {diagram.name!r} with its present parameters. "
-            "Make it by diagram.worst_case(…).",
-            port="worst_case",
-        )
-
-
 def read_task(
     diagram: WiredDiagram,
     given: WorstCase | WorstCaseTask | str | os.PathLike[str] | None,
@@ -68,8 +53,19 @@ def read_task(
         given = WorstCaseTask.read(given)
     if isinstance(given, WorstCaseTask):
         given.check(diagram, requirements)
-    elif given is not None:
-        check_worst_case(diagram, given)
+        return given
+    if given is None:
+        return None
+    if not isinstance(given, WorstCase):
+        raise OptionError(
+            f"found {given!r}; expected a worst case. Give diagram.worst_case(…), or a TOML file.", port="worst_case"
+        )
+    if content_hash(given.wired if given.given is None else given.given) != content_hash(diagram):
+        raise OptionError(
+            f"found a worst case of another diagram; expected one of {diagram.name!r} with its present parameters. "
+            "Make it by diagram.worst_case(…).",
+            port="worst_case",
+        )
     return given
 
 
@@ -152,7 +148,7 @@ class ReportedWorstCase:
     problem: str = ""
 
     def outcomes(self) -> dict[str, StudyCase]:
-        """Return the diagram as it is and the worst case, by the paths that their numbers stand below."""
+        """Return the diagram as it is and the worst case, by the paths of their numbers."""
         nominal = min(self.found.nominal, key=lambda case: case.goodness)
         return {f"{KEY}.as_it_is": nominal, f"{KEY}.worst": self.found.worst}
 
