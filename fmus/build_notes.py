@@ -9,7 +9,7 @@ from contextvars import ContextVar
 from threading import Lock, Timer
 
 LATE = 1.0
-"""Time in s that a compiler takes before a terminal is told; what is compiled was written before."""
+"""Time in s that a compiler takes before a terminal shows it; what is compiled was written before."""
 _LISTENER: ContextVar[Callable[[str], None] | None] = ContextVar("loopwright_build_listener", default=None)
 
 

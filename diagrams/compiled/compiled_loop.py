@@ -156,7 +156,7 @@ class CompiledLoop:
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
         ticks = [self._bind(tick, arguments, results) for tick in code.ticks.values()]
-        # The tick after those with code stands for all other sets of clocks; C calls Python for it.
+        # The tick after those with code serves all other sets of clocks; C calls Python for it.
         if rest is not None:
             ticks.append(TickStructure(self.called.function(TICK, lambda *_: rest(), 1)))
         self.structure = LoopStructure(

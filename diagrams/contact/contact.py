@@ -212,7 +212,7 @@ class Contact:
         """Run the nonlinear diagram at 0.97 and at 1.03 of a limit, with the environment at the plant.
 
         The controller is the diagram's. The growth rate of the mode is measured, and compared with the linear loop's.
-        The result's ``method`` tells where the environment is:
+        The result's ``method`` says where the environment is:
 
         - "inside": in the equations of a plant of the library, in its own FMU or block.
         - "solver": next to another plant with equations, or next to an FMU in model exchange. The solver

@@ -224,7 +224,7 @@ class Instant:
     def _arguments(self, path: str, inputs: dict[str, Any]) -> tuple[Any, Any, list[Any], Any]:
         """Return t, x, the inputs and p of a block, as its functions take them.
 
-        Inputs that are not computed yet are not used by the outputs that are; zeros stand in.
+        Inputs that are not computed yet are not used by the outputs that are; zeros replace them.
         """
         shapes = self.functions.traced[path].inputs
         columns = [np.zeros(size(s)) if inputs[q] is None else inputs[q] for q, s in shapes.items()]

@@ -340,7 +340,7 @@ class InexactDerivatives(Finding):
 @explain_calls
 @dataclass(frozen=True)
 class RefutedDerivatives(Finding):
-    """Directional derivatives of an FMU that are plainly wrong: differences of its own values stand in for them.
+    """Directional derivatives of an FMU that are plainly wrong: differences of its own values replace them.
 
     Attributes
     ----------

@@ -165,7 +165,7 @@ def _display(figure: Any) -> None:
             _publish(one)
             if _closes_figures():  # else the end of the cell would show it a second time
                 pyplot.close(one)
-    elif hasattr(figure.canvas, "_repr_mimebundle_"):  # a live view, which the end of its own cell shows
+    elif hasattr(figure.canvas, "_repr_mimebundle_"):  # a live view, which the end of its cell shows
         if figure.cell != _shell().execution_count:
             from IPython.display import display
 

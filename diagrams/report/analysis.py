@@ -161,14 +161,14 @@ def analyse(
         `read_frequency_data`). Their margins, with intervals, are given next to the model's, and requirements hold
         for them as for the model's: passed only if the whole interval is within the limits.
     contacts : mapping of str to Contact, or path, optional
-        Contacts of an environment with the plant, by names that stand in dotted paths: ``{"tool":
+        Contacts of an environment with the plant, by names that are parts of dotted paths: ``{"tool":
         diagram.contact(…)}``; or a TOML file with tables ``[contact.NAME]``, which may be that of ``requirements``,
         too. Each gets its admittance, the limits of coupled stability, a map of them, a trial in the nonlinear run, and
         a row on the first page. Limits that are required of it get verdicts.
     worst_case : WorstCase or path, optional
         A worst case of this diagram, of `Diagram.worst_case`, or a TOML file with a table ``[worst_case]``, which may
         be that of ``requirements``, too: it gets a section, with a run that confirms it, and a line on the first page.
-        The limits that it was looked for with get verdicts of their own. Limits of its numbers fail where it is
+        The limits that it was looked for with get separate verdicts. Limits of its numbers fail where it is
         unstable. One that can't be looked for, as at a wire without a loop, is left out with the reason.
     progress : bool or callable, optional
         Show the key of each section before it is made, and what is being computed or confirmed in it (margins, steps,
@@ -179,7 +179,7 @@ def analyse(
         the same. Without it there are two where the report is written, and two processors.
     summary : bool
         Whether the page, the PDF and the notebook show the summary alone: two pages. All numbers are computed, and
-        stand in the JSON.
+        are in the JSON.
     appendix : bool
         Whether they show the appendix: all numbers, definitions and details.
 

@@ -439,7 +439,7 @@ class Run(ShownAsTable):
         Parameters
         ----------
         *names : str or list of str
-            Signals or entries of them, ``"q[1]"``, each in an axis of its own; those of a list share one, and so do
+            Signals or entries of them, ``"q[1]"``, each in a separate axis; those of a list share one, and so do
             a vector's entries: ``run.plot("speed", ["reference", "angle"])``. Without any, all named wires.
         against : Run, measured data or mapping of str to them, optional
             What is drawn over this run, by the names that the legend has: ``{"kp = 10": other}``. Measured data are a

@@ -1,4 +1,4 @@
-"""Parts of a diagram that become FMUs of their own in an SSP: subsystems without FMUs, and blocks between FMUs."""
+"""Parts of a diagram that become separate FMUs in an SSP: subsystems without FMUs, and blocks between FMUs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Export:
 
 
 def split_diagram(wired: WiredDiagram, fmus: set[str], inputs: set[str]) -> tuple[WiredDiagram, list[str]]:
-    """Return a diagram in which what becomes an FMU is in subsystems of its own, and their paths.
+    """Return a diagram in which what becomes an FMU is in separate subsystems, and their paths.
 
     ``fmus``, ``inputs``: paths of its FMUs, and of the constants that are inputs of the SSP.
     """
@@ -109,7 +109,7 @@ def _close(table: Structure, loose: set[str], others: set[str]) -> set[str]:
 
 
 def _group(wired: WiredDiagram, members: set[str]) -> WiredDiagram:
-    """Return the diagram with some blocks in a subsystem of their own, whose outputs are what others read."""
+    """Return the diagram with some blocks in a separate subsystem, whose outputs are what others read."""
     table = wired.structure.copy()
     if GROUP in table.subsystems or GROUP in table.blocks:
         raise SspFileError(

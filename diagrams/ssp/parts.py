@@ -56,7 +56,7 @@ class FmuPart:
 
     @cached_property
     def split(self) -> frozenset[str]:
-        """Arrays of several dimensions, gathered from scalars, whose scalars are ports of their own."""
+        """Arrays of several dimensions, gathered from scalars, whose scalars are separate ports."""
         gathered = {array for array, _ in self.description.elements.values()}
         return frozenset(a for a in gathered if len(self.description.variables[a].shape) > 1)
 

@@ -23,9 +23,9 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 @dataclass(frozen=True)
 class Package:
-    """Files of an SSP, and of a description that is a file of its own.
+    """Files of an SSP, and of a description that is a separate file.
 
-    ``archive``: the archive; None for a description that is a file of its own.
+    ``archive``: the archive; None for a description that is a separate file.
     """
 
     file: Path
@@ -146,7 +146,7 @@ class PackagedFile:
 
 
 def open_package(file: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> Package:
-    """Open an SSP, or a description that is a file of its own, or its folder.
+    """Open an SSP, or a description that is a separate file, or its folder.
 
     Raises `SspFileError` if the file is missing, or its archive is unsafe, damaged or beyond the limits, as of an FMU.
     """

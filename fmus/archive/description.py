@@ -107,7 +107,7 @@ class FmuDescription(ShownAsTable):
     """Fixed step of the FMU's own integrator in s (fixedInternalStepSize of FMI 3.0), or None; steps must be multiples
     of it."""
     stop_time: float | None = None
-    """End of the default experiment in s, beyond which some FMUs take no step unless they are told a later one."""
+    """End of the default experiment in s, beyond which some FMUs take no step unless they are given a later one."""
     step_size: float | None = None
     """Communication step of the default experiment in s."""
     dependencies: Dependencies = field(default_factory=dict)

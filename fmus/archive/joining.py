@@ -1,4 +1,4 @@
-"""Scalars with names of their own become elements of an array port: ``rename={"s_Y": "position[1]", …}``."""
+"""Scalars with unrelated names become elements of an array port: ``rename={"s_Y": "position[1]", …}``."""
 
 from __future__ import annotations
 

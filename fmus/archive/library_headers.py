@@ -17,7 +17,7 @@ _MACHINES = {
     "darwin": {0x7: "x86", 0x1000007: "x86_64", 0x100000C: "aarch64"},
 }
 LFS_POINTER = b"version https://git-lfs"
-"""Beginning of the small text that stands for a file in a repository with Git LFS."""
+"""Beginning of the small text that replaces a file in a repository with Git LFS."""
 _LOADED, _DYNAMIC = 1, 2
 _NEEDED, _HASH, _STRTAB, _SYMTAB, _STRSZ, _GNU_HASH = 1, 4, 5, 6, 10, 0x6FFFFEF5
 _SHARED = 3

@@ -1,4 +1,4 @@
-"""Descriptions that FMPy refuses although the FMU can run: the faulty attribute is left out or filled in, and told."""
+"""Descriptions that FMPy refuses although the FMU can run: the faulty attribute is left out or filled in, and named."""
 
 from __future__ import annotations
 

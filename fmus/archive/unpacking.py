@@ -27,7 +27,7 @@ def unpack(description: FmuDescription) -> Path:
     if os.path.exists(resources):
         return folder
     with explain_cache_errors():
-        if resources.exists():  # whoever may not look is told so
+        if resources.exists():  # an error for whoever may not look
             return folder
     archive = FmuArchive.open(description.file, description.limits)
     if archive.digest != description.digest:

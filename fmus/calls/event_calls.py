@@ -56,7 +56,7 @@ class EventCalls:
     update: Call
     leave: Call | None
     complete: Call
-    """It tells a step of the solver that was accepted."""
+    """It reports a step of the solver that was accepted."""
     final: Any
     """Argument of ``complete``: whether no earlier state will be restored, a C value that can be changed."""
     answers: AnswersAt

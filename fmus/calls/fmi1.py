@@ -67,7 +67,7 @@ class Fmi1Calls(FmiCalls):
             raise RuntimeError(f"fmiInstantiate{'Model' if self.is_model else 'Slave'} returned nothing")
 
     def set_up(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
-        """Do nothing: `enter_initialization_mode` takes the times, and tolerances are not told."""
+        """Do nothing: `enter_initialization_mode` takes the times, and tolerances are not passed."""
 
     def enter_initialization_mode(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
         """Initialize the FMU (3.3); one for model exchange with the start values of its inputs."""

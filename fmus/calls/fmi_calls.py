@@ -178,9 +178,9 @@ class FmiCalls(ABC):
     initialized: EventUpdate | None = None
     """What the initialization says of events in model exchange, in FMI 1.0."""
     event_mode_used = False
-    """Whether the FMU is told that its events are handled in Event Mode; set it before `instantiate`."""
+    """Whether the FMU is informed that its events are handled in Event Mode; set it before `instantiate`."""
     early_return_allowed = False
-    """Whether the FMU is told that it may end a step early; set it before `instantiate`."""
+    """Whether the FMU is informed that it may end a step early; set it before `instantiate`."""
     intermediate_inputs: tuple[int, ...] = ()
     """Value references of inputs that are set within a step (FMI 3.0, 4.2.2); set them before `instantiate`."""
 
@@ -298,7 +298,7 @@ class FmiCalls(ABC):
     """Function for bound calls that notes whether texts have changed; None in this process, where they are read."""
 
     def slopes_call(self, references: Sequence[int], slopes: np.ndarray) -> Call:
-        """Return the call that tells the slopes of inputs within a step, which are in an array; not in FMI 3.0."""
+        """Return the call that passes the slopes of inputs within a step, which are in an array; not in FMI 3.0."""
         n, kept = slopes.size, (ctypes.c_uint * len(references))(*references)
         values = (ctypes.c_int * n)(*[1] * n), ctypes.c_void_p(slopes.ctypes.data)
         return self.function("SetRealInputDerivatives"), (self.instance_argument, kept, ctypes.c_size_t(n), *values)

@@ -251,7 +251,7 @@ class ModelExchangeInstance(RunningFmu):
         return x
 
     def _read_nominals(self) -> np.ndarray:
-        """Return the states' nominal values; 1 stands in for a value that is 0 or no number."""
+        """Return the states' nominal values; 1 replaces a value that is 0 or no number."""
         found = np.abs(self._get("nominals"))
         usable = np.isfinite(found) & (found > 0.0)
         if not usable.all() and not self._has_odd_nominals:

@@ -129,7 +129,7 @@ class StepFailures(SavingFmu):
         Raises
         ------
         FmuRuntimeError
-            If the step has not come to its end, and where nobody is told of ends; its ``ends_at`` is the time.
+            If the step has not come to its end, and where nobody asks for ends; its ``ends_at`` is the time.
         """
         self.ends_run = True
         reached = t + h if math.isnan(reached) else min(max(reached, t), t + h)

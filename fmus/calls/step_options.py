@@ -66,7 +66,7 @@ class StepOptions:
     Parameters
     ----------
     tolerance : float, optional
-        Relative tolerance that the FMU is told (toleranceDefined); None leaves it to the FMU.
+        Relative tolerance that the FMU is given (toleranceDefined); None leaves it to the FMU.
     event_mode : bool, optional
         Use Event Mode (FMI 3.0, 4.2.1): events end a step, discrete inputs and tunable parameters change there, and
         periodic input clocks tick. None: where the FMU has clocks and ``hasEventMode``, and is none of Loopwright's,
@@ -85,12 +85,12 @@ class StepOptions:
         ``providesIntermediateUpdate``. This helps where inputs are smooth; where they are held
         or jump, it overshoots.
     time : StepTime or {"multiplied", "added"}
-        Arithmetic by which the FMU is told the time.
+        Arithmetic by which the FMU's time is computed.
     communication_step : float or Fraction, optional
         Seconds between two communication points of the FMU, a multiple of the run's base. None: at the ticks of the
         subsystems that it is wired to, or at those of the run's ``step``.
     stop_time : float, optional
-        End of the experiment in s that the FMU is told (stopTimeDefined). Some FMUs take no step beyond it, or beyond
+        End of the experiment in s that the FMU is given (stopTimeDefined). Some FMUs take no step beyond it, or beyond
         their default experiment without it. None: it is open.
 
     Raises

@@ -149,7 +149,7 @@ def _judge_platform(archive: FmuArchive, summary: Mapping[str, Any]) -> Iterator
     if found is None:
         if not any(tuple_of(folder) == native and names for folder, names in binaries.items()):
             yield _absent(native, binaries, summary)
-        return  # of several libraries with other names, the description's reading tells
+        return  # of several libraries with other names, the description's reading says which
     folder, names = found
     for name in names:
         place = f"binaries/{folder}/{name}"

@@ -54,7 +54,7 @@ class PythonChild(_Messages):
         program = [find_python(), "-c", f"from {module} import main; main()"]
         self._process = group.start(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         super().__init__(self._process.stdout, self._process.stdin)
-        with suppress(OSError):  # it has ended: what is sent or received next tells it
+        with suppress(OSError):  # it has ended: what is sent or received next shows it
             self.send(sys.path)
 
     def has_ended(self) -> bool:

@@ -1,4 +1,4 @@
-"""The child: calls functions of an FMU's library, as it is told.
+"""The child: calls functions of an FMU's library, as it is asked.
 
 It imports the standard library only, to start quickly. It reads frames from its command pipe, and numbers of bound
 sequences from the shared words (`wire`). All that the FMU writes to its standard output goes to a file, and its log

@@ -44,7 +44,7 @@ class Derivation:
         Largest distance of the FMU's directional derivatives from differences of its own values, relative to their
         size; 0 where they agree, NaN where they could not be compared.
     refuted : bool
-        Whether that gap is so large that differences stand in for the derivatives that are wrong.
+        Whether that gap is so large that differences replace the derivatives that are wrong.
     coarseness : float
         Largest error of a derivative by differences, relative to the largest change of its row, where the FMU's values
         move in steps, are coarsely rounded, or have a kink; 0 where they tell their slopes well.

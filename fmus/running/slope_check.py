@@ -138,7 +138,7 @@ class _Checker:
             yield np.where(self.moved, sign * rng.uniform(0.5, 1.0, self.at.size) * self.sizes, 0.0)
 
     def compare(self, J: np.ndarray, v: np.ndarray) -> _Comparison:
-        """Compare the derivatives along a direction with differences, at the length that tells most."""
+        """Compare the derivatives along a direction with differences, at the length that shows most."""
         found = self._compare_at(J, v, _LENGTHS[0])
         for length in _LENGTHS[1:]:
             if np.all(found.is_close & (found.error <= SHARP * found.whole)):

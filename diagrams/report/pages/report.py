@@ -36,7 +36,7 @@ class Report(Document):
     """
 
     def _repr_html_(self) -> str:
-        """Show it in a notebook, in an inner page of its own: its styles are meant for a whole page."""
+        """Show it in a notebook, in a separate inner page: its styles are meant for a whole page."""
         page = escape(to_html(self), quote=True)
         return f'<iframe srcdoc="{page}" style="width:100%;height:45em;border:1px solid #d5dbe1"></iframe>'
 

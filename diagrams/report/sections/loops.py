@@ -212,7 +212,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         tables.append(_periodic_table(wire, periodic))
     if beside:
         columns = ("variant", "number", "here", "python-control", "its function", "right", "why")
-        title = f"Margins at {wire} beside python-control's own values"
+        title = f"Margins at {wire} next to python-control's own values"
         differing = tuple(row for row in beside if row[RIGHT] != "both")
         note = TEXTS.line("agreeing", count=len(beside) - len(differing))
         if differing:
@@ -372,7 +372,7 @@ def widened(wire: str, part: LoopPart) -> Section:
 
     The error of a response is found at the frequencies of the section: by moving the model's entries by the
     differences' own uncertainty, and by the equations held over a step in place of the step that the FMU's solver
-    makes, where it tells them.
+    makes, where it names them.
     """
     changed: dict[int, Number] = {}
     numbers, text = dict(part.section.numbers), list(part.section.text)

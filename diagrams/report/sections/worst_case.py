@@ -210,7 +210,7 @@ def _ranges(found: WorstCase) -> Table:
 
 
 def worst_case_of(reported: ReportedWorstCase | MissingWorstCase) -> Section:
-    """Return the section on a worst case: its parameters, its number beside the nominal one, its run, and a scatter."""
+    """Return the section on a worst case: its parameters, its number and the nominal one, its run, and a scatter."""
     if isinstance(reported, MissingWorstCase):
         return reported.section()
     found, run = reported.found, reported.run
@@ -239,7 +239,7 @@ def worst_case_of(reported: ReportedWorstCase | MissingWorstCase) -> Section:
         (case.replace("_", " "), ROWS.get(name, GROWTH if name == GROWING else name), number)
         for (case, _, name), number in ((path.partition("."), number) for path, number in numbers.items())
     ]
-    tables = [Table("Worst case, beside the diagram as it is", ("case", "number", "value"), tuple(rows), digits=4)]
+    tables = [Table("Worst case, next to the diagram as it is", ("case", "number", "value"), tuple(rows), digits=4)]
     given = tuple((name, _text(value)) for name, value in worst.parameters.items())
     if given:
         tables.append(Table("Parameters of the worst case", ("parameter", "value"), given))
