@@ -363,7 +363,7 @@ def test_the_heading_has_its_lines_and_the_page_no_path_of_this_machine():
     report = analyse(loop(), only=("subject",), about=about)
     page = to_html(report)
     assert report.title == "The tank"
-    for text in (*about.values(), content_hash(loop().wired)[:16]):
+    for text in (*about.values(), f"{content_hash(loop().wired)[:12]}… (digest of the diagram"):
         assert text in page
     plant = experiments.path_following().diagram
     assert str(plant["plant"].file.parent) not in to_html(analyse(plant, only=("subject",)))
