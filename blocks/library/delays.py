@@ -111,7 +111,7 @@ class VariableDelay(StartsAtInput, Block):
         y = 0.0
         for n in range(self.samples + 1):  # the share of the sample n ticks ago: a hat of width 2 around n
             distance = np.abs(back - n)
-            share = np.where(distance < 1.0, 1.0 - distance, 0.0)
+            share = np.where(distance >= 1.0, 0.0, 1.0 - distance)  # a delay that is NaN gives NaN
             y = y + share * (u.u if n == 0 else x.line[-n])
         return y
 

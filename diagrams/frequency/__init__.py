@@ -18,7 +18,7 @@ from .nyquist import NyquistCount, nyquist_count
 from .periodic_margins import PeriodicMargins, periodic_margins
 from .pole_maps import plot_poles
 from .pole_placement import place, relative_difference
-from .poles_and_zeros import find_hidden_unstable
+from .poles_and_zeros import find_hidden_unstable, finite_zeros
 from .python_control_margins import Comparison, compare_margins, compare_with_control
 from .realization import Realization
 from .sampled_design import SampledDesign, sampled_gains, sampled_poles
@@ -90,6 +90,7 @@ __all__ = [
     "find_disk_frequency",
     "find_hidden_unstable",
     "find_pade_limit",
+    "finite_zeros",
     "first_largest",
     "gang_of_four",
     "hold_inputs",

@@ -29,6 +29,7 @@ from .delayed_system import DelayedSystem
 from .loop_drawing import DrawnLoop, describe_margins, draw_bode_axes, draw_nichols_axes, draw_nyquist_axes
 from .loop_margins import Margins, margins
 from .pole_maps import plot_poles, plot_root_locus, refuse_delays
+from .poles_and_zeros import finite_zeros
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -209,7 +210,7 @@ class LoopPlots:
         (name,) = _name_loops((self,), None)
         refuse_delays(self, name)
         loop: Any = self
-        return plot_poles(np.ravel(loop.poles()), np.ravel(loop.zeros()), float(self.dt or 0.0), f"poles of {name}")
+        return plot_poles(np.ravel(loop.poles()), finite_zeros(loop), float(self.dt or 0.0), f"poles of {name}")
 
     @accepts(t=kinds.numbers, labels=kinds.names)
     def step(self, *others: Any, t: float | None = None, labels: Sequence[str] | None = None) -> Figure:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...blocks.core import OptionError, decibels, with_unit
 from ..plotting import BLUE, COLORS, DARK, GREEN, GREY, STONE, VERMILION, legend_above, shown_figure
+from .poles_and_zeros import finite_zeros
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -109,7 +110,7 @@ def _is_in(points: np.ndarray, view: View) -> np.ndarray:
 def plot_root_locus(loop: Any, name: str, gains: np.ndarray | None, margins: Margins | None) -> Figure:
     """Return the locus of the closed-loop poles; see `LoopPlots.root_locus`."""
     dt = float(loop.dt or 0.0)
-    poles, zeros, now = np.ravel(loop.poles()), np.ravel(loop.zeros()), closed_loop_poles(loop, 1.0)
+    poles, zeros, now = np.ravel(loop.poles()), finite_zeros(loop), closed_loop_poles(loop, 1.0)
     crossing = [] if margins is None else [c.frequency.value for c in margins.gain_crossovers]
     limits = _limits(margins, dt)
     view = _view([poles, zeros, now, np.array([pole for _, pole in limits])], dt, max(crossing, default=0.0))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from .realization import Realization
+
+if TYPE_CHECKING:
+    from control import StateSpace
 
 SIDES = np.array([-10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10])
 """Distances from a pole or zero, in parts of its distance from the axis, at which a scan has frequencies."""
@@ -155,7 +158,7 @@ def transmission_zeros(r: Realization) -> np.ndarray:
     from scipy.linalg import eig
 
     n = r.order
-    if not n or len(r.D) != 1 or not (finite := n - count_zeros_at_infinity(r)):
+    if not n or len(r.D) != 1 or not (finite := n - count_zeros_at_infinity(r.A, r.B, r.C, r.D)):
         return np.zeros(0)
     b, c = np.linalg.norm(r.B) or 1.0, np.linalg.norm(r.C) or 1.0
     pencil = np.block([[r.A, r.B / b], [r.C / c, r.D / (b * c)]])
@@ -167,19 +170,32 @@ def transmission_zeros(r: Realization) -> np.ndarray:
     return np.asarray(zeros[np.abs(zeros) < 1e6 * max(r.scale, 1e-300)])
 
 
-def count_zeros_at_infinity(r: Realization) -> int:
+def count_zeros_at_infinity(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> int:
     """Return the relative degree of a loop with one channel: the place of the first Markov parameter D, CB, CAB, … ≠ 0.
 
     A sum of products is 0 where it is less than its rounding, which follows the sizes of the products.
     """
-    C, x, size = r.C[0], r.B[:, 0], np.abs(r.B[:, 0])
-    if r.D[0, 0]:  # what rounding left in it was removed with the reduction
+    order, row, x, size = len(A), C[0], B[:, 0], np.abs(B[:, 0])
+    if D[0, 0]:  # what rounding left in it was removed with the reduction
         return 0
-    for k in range(1, r.order):
-        if abs(C @ x) > 1e-15 * (r.order + k) * (np.abs(C) @ size):
+    for k in range(1, order):
+        if abs(row @ x) > 1e-15 * (order + k) * (np.abs(row) @ size):
             return k
-        x, size = r.A @ x, np.abs(r.A) @ size
-    return r.order
+        x, size = A @ x, np.abs(A) @ size
+    return order
+
+
+def finite_zeros(system: StateSpace) -> np.ndarray:
+    """Return the zeros of a system without those at infinity, which rounding scatters to large numbers.
+
+    With one channel their number is the relative degree. With several it is not known: those beyond 1e6 times the
+    largest pole are left out.
+    """
+    zeros = np.asarray(np.ravel(system.zeros()), dtype=complex)
+    zeros = zeros[np.argsort(np.abs(zeros), kind="stable")]
+    if system.ninputs == system.noutputs == 1:
+        return zeros[: max(system.nstates - count_zeros_at_infinity(system.A, system.B, system.C, system.D), 0)]
+    return zeros[np.abs(zeros) < 1e6 * np.max(np.abs(system.poles()), initial=1e-300)]
 
 
 def find_hidden_unstable(r: Poles) -> tuple[complex, ...]:

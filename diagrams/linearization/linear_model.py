@@ -44,6 +44,7 @@ from ..frequency import (
     DelayMatrices,
     delayed_loop_class,
     delayed_system_class,
+    finite_zeros,
     loop_class,
     mu_bound,
     order_key,
@@ -345,7 +346,7 @@ class Linearization(ShownAsTable):
         ratios and natural frequencies. With delays there are infinitely many poles, of which the rightmost are drawn.
         """
         square = len(self.inputs) == len(self.outputs) > 0 and self.delays is None
-        zeros = np.ravel(self.system.zeros()) if square else None
+        zeros = finite_zeros(self.system) if square else None
         return plot_poles(self.poles, zeros, self.dt, f"poles of {self.wired.name}", are_all=self.delays is None)
 
     @accepts(None, required=kinds.names)

@@ -156,7 +156,7 @@ def _state(block: Block, name: str, shape: Shape, shapes: dict[str, Shape]) -> V
     )
 
 
-@accepts(name=kinds.text, clocks=kinds.flag)
+@accepts(name=kinds.text, clocks=kinds.flag, own_functions=kinds.flag, arrays=kinds.flag)
 def build(
     block: Any,
     out: Path | str | None = None,

@@ -115,7 +115,7 @@ def test_a_moving_point_within_the_period_is_differentiated_along_its_motion():
         return make_tank(outlet=0.7 + change, level=1.44, sample_time=T)
 
     model = make_tank(level=1.44, sample_time=T).replace({"r.value": 2.0}).linearize(0.2)
-    changed = at_change(lambda c: make(c).replace({"r.value": 2.0}), "u", 1e-3, point=0.2)
+    changed = at_change(lambda c: make(c).replace({"r.value": 2.0}), "u", 1e-3, at=0.2)
     found = slopes_by(model, "u", "tank.outlet", find=lambda d: d.facade.operating_point(0.2))["tank.outlet"]
     for mine, other in zip(found.slopes, changed, strict=True):
         assert mine == pytest.approx(other, abs=2e-8 * max(1.0, np.abs(other).max(initial=0.0)))
