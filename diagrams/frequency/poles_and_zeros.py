@@ -195,7 +195,7 @@ def finite_zeros(system: StateSpace) -> np.ndarray:
     zeros = zeros[np.argsort(np.abs(zeros), kind="stable")]
     if system.ninputs == system.noutputs == 1:
         return zeros[: max(system.nstates - count_zeros_at_infinity(system.A, system.B, system.C, system.D), 0)]
-    return zeros[np.abs(zeros) < 1e6 * np.max(np.abs(system.poles()), initial=1e-300)]
+    return np.asarray(zeros[np.abs(zeros) < 1e6 * np.max(np.abs(system.poles()), initial=1e-300)])
 
 
 def find_hidden_unstable(r: Poles) -> tuple[complex, ...]:
