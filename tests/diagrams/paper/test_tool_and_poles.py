@@ -17,13 +17,14 @@ def slowest_pairs(diagram):
 def test_without_sampling_a_tool_adds_to_the_virtual_masses(tool):
     """−d/(2 (m_d + m)) of m_d = 0.5 kg, ζ = 0.6, k = 10 N/m along the path and 2 kg, 0.3, 200 N/m across it.
 
-    The sensor feeds the linearizing law, too, whose error dynamics move the modes by some 1e-5 of themselves.
+    The sensor feeds the linearizing law, too, whose error dynamics move the modes by a part of themselves that grows with
+    the tool: 2e-5 with 0.3 kg, 5e-4 with 3 kg.
     """
     found = slowest_pairs(compliance(tool_mass=tool).diagram.continuous())
     exact = []
     for m, zeta, k in ((0.5, 0.6, 10.0), (2.0, 0.3, 200.0)):
         exact += 2 * [-2 * zeta * np.sqrt(k * m) / (2 * (m + tool))]
-    np.testing.assert_allclose(found[:4], np.sort(exact)[::-1], rtol=1e-4)
+    np.testing.assert_allclose(found[:4], np.sort(exact)[::-1], rtol=2e-4 * max(tool, 0.5))
 
 
 @pytest.mark.parametrize(("tool", "stable"), [(0.3, True), (1.0, False)])

@@ -84,6 +84,7 @@ def test_experiment_c_has_the_bits_of_its_first_run():
         assert {n: run[n].tobytes() for n in run.names} == {n: runs[0][n].tobytes() for n in run.names}
 
 
+@pytest.mark.one_tier
 def test_a_further_run_calls_few_functions_of_python():
     diagram, seen = experiments.hand_guiding().diagram, []
     for _ in range(3):

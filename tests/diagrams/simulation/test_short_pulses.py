@@ -145,6 +145,7 @@ def test_a_linear_model_along_the_motion_passes_through_the_pulse(case):
     assert grown["z.y"] == pytest.approx(6.8, rel=1e-3)  # (10 s − 3.2 s), but for the width of the pulse
 
 
+@pytest.mark.one_tier
 def test_instants_between_samples_are_asked_for_once(monkeypatch):
     """Noise that changes 6 times between two samples, by 1/(s + 1): each change is found once, however C is called."""
     asked, spent, found = [], [], BandLimitedNoise.next_instant
