@@ -76,12 +76,14 @@ class _Reader:
         self._numbers: list[tuple[str, str]] = []
         self._pointers: list[tuple[str, str]] = []
         self._names: dict[int, str] = {}  # by address
+        self._named: dict[str, Any] = {}
         self._inside: list[tuple[int, int, str]] = []  # structs: begin, end, member
         owners = {id(owner): owner for owner in _memories(kept)}
         for name, vector in vectors.items():
             owner = _owner(vector)
             owners[id(owner)] = owner
             self._names[_span(owner)[0]] = name
+            self._named[name] = owner
         self._owners = sorted(owners.values(), key=_span)
         self._begins = [_span(owner)[0] for owner in self._owners]
 
@@ -90,10 +92,10 @@ class _Reader:
             begin = ctypes.addressof(structure)
             self._inside.append((begin, begin + ctypes.sizeof(structure), name))
             self._fields[name] = Field(name, _STRUCTS[type(structure)], each=ctypes.sizeof(structure))
-        for owner in self._owners:
-            known = self._names.get(_span(owner)[0])
-            if known is not None and isinstance(owner, np.ndarray):
-                self._fields[known] = Field.of(known, owner)
+        # In the order of their names, not of addresses: one diagram has one text.
+        for name, owner in self._named.items():
+            if self._names[_span(owner)[0]] == name and isinstance(owner, np.ndarray):
+                self._fields[name] = Field.of(name, owner)
         for name, structure in roots.items():
             self._read_struct(name, structure)
         return LoopMemory(tuple(self._fields.values()), tuple(self._numbers), tuple(self._pointers))

@@ -186,16 +186,25 @@ def count_zeros_at_infinity(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.n
 
 
 def finite_zeros(system: StateSpace) -> np.ndarray:
-    """Return the zeros of a system without those at infinity, which rounding scatters to large numbers.
+    """Return the zeros of a system with as many inputs as outputs, without those that rounding scatters from infinity.
 
-    With one channel their number is the relative degree. With several it is not known: those beyond 1e6 times the
-    largest pole are left out.
+    The number of those at infinity is the relative degree of det G: with one channel by its Markov parameters, with
+    several by the slope of det G over far real frequencies. Where that slope is no whole number, zeros beyond 1e6 times
+    the size of A are left out.
     """
     zeros = np.asarray(np.ravel(system.zeros()), dtype=complex)
     zeros = zeros[np.argsort(np.abs(zeros), kind="stable")]
-    if system.ninputs == system.noutputs == 1:
-        return zeros[: max(system.nstates - count_zeros_at_infinity(system.A, system.B, system.C, system.D), 0)]
-    return np.asarray(zeros[np.abs(zeros) < 1e6 * np.max(np.abs(system.poles()), initial=1e-300)])
+    A, B, C, D = (np.asarray(matrix, dtype=float) for matrix in (system.A, system.B, system.C, system.D))
+    if len(D) == 1:
+        return np.asarray(zeros[: max(len(A) - count_zeros_at_infinity(A, B, C, D), 0)])
+    far = 1e3 * (float(np.linalg.norm(A, 2)) if A.any() else 1.0)
+    near, beyond = (abs(np.linalg.det(C @ np.linalg.solve(s * np.eye(len(A)) - A, B) + D)) for s in (far, 4.0 * far))
+    if not near or not beyond:
+        return np.zeros(0)  # G has no inverse: every number would be a zero
+    degree = float(np.log(near / beyond) / np.log(4.0))
+    if abs(degree - round(degree)) < 0.05:  # poles and zeros of the size of A bend the slope by some 1e-3 each
+        return np.asarray(zeros[: max(len(A) - round(degree), 0)])
+    return np.asarray(zeros[np.abs(zeros) < 1e3 * far])
 
 
 def find_hidden_unstable(r: Poles) -> tuple[complex, ...]:

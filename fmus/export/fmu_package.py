@@ -210,7 +210,7 @@ def write_atomically(path: Path, data: bytes, instead: str = OTHER_FOLDER) -> No
 
 def check_version(fmi: object) -> None:
     """Raise `FmuError` unless FMUs of this version of FMI are built."""
-    if not isinstance(fmi, int) or fmi not in (2, 3):
+    if not kinds.whole.holds(fmi) or fmi not in (2, 3):
         raise FmuError(f"found fmi={fmi!r}, expected 3 (FMI 3.0) or 2 (FMI 2.0). Give one of them.")
 
 

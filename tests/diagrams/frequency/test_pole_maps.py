@@ -102,6 +102,23 @@ def test_maps_of_poles_and_zeros(continuous):
     assert np.allclose(points(closed.pzmap().axes[0], "o"), [-3.0], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "zeros"),
+    [
+        (([1.0, 3.0], [1.0, 0.0, 0.0]), ([1.0], [1.0, 0.0]), [-3.0]),  # all poles are at 0
+        (([1.0], [1.0, 3.0, 3.0, 1.0]), ([1.0], [1.0, 6.0, 12.0, 8.0]), []),  # three zeros at infinity in each
+        (([2.0, 1.0], [1.0, 1.0]), ([1.0, 5.0], [1.0, 2.0, 7.0]), [-5.0, -0.5]),
+    ],
+)
+def test_zeros_at_infinity_are_not_drawn_with_several_channels_either(first, second, zeros):
+    a = TransferFunction(numerator=first[0], denominator=first[1], name="a")
+    b = TransferFunction(numerator=second[0], denominator=second[1], name="b")
+    diagram = Diagram("d", a(Constant(value=0.0, name="u")), b(Constant(value=0.0, name="v")))
+    axes = diagram.linearize(inputs=("u", "v"), outputs=("a", "b")).pzmap().axes[0]
+    assert np.allclose(points(axes, "o") if zeros else [], zeros, atol=1e-9)
+    assert any(line.get_marker() == "o" and len(line.get_xdata()) for line in axes.lines) == bool(zeros)
+
+
 def test_a_loop_with_dead_time_has_no_locus_but_its_model_has_poles():
     level = Integrator(name="level")
     pipe = TransportDelay(delay=0.5, name="pipe")
