@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable
 from decimal import Context, Decimal, localcontext
 from functools import lru_cache
+from importlib import resources
 from math import factorial, frexp, ldexp
 
 import numpy as np
@@ -21,6 +22,11 @@ SINGLE_FUNCTIONS = (*FUNCTIONS, "floor", "ceil", "fmin", "fmax")
 """Those of single precision: with what a processor for it has no instruction for."""
 _NODES = 306  # of tanh, up to which it differs from 1
 _DIGITS = 60
+
+
+def read_runtime(name: str) -> str:
+    """Return the text of a C file of ``runtime/``."""
+    return (resources.files(__package__) / "runtime" / name).read_text(encoding="utf-8")
 
 
 def prepare_functions(equations: str) -> str:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from importlib import resources
 from pathlib import Path
 
 from ..platform import is_built_here
 from .c_code import runtime
-from .elementary_tables import FUNCTIONS, prepare_functions
+from .elementary_tables import prepare_functions, read_runtime, restore_functions
 from .own_sources import INCLUDE, expand_sources, name_apart, read_own_sources
 
 _BRANCH_FREE = ("sin", "cos", "tanh")
@@ -35,7 +34,7 @@ def inline_model(path: str | os.PathLike[str], prefix: str) -> str | None:
         return None
     if "#define LW_N_Z 0\n" not in sources["model.c"]:
         return None
-    text = expand_sources("model.c", sources, {"elementary.c": _read("fast.c")}) + _read("in_loop.c")
+    text = expand_sources("model.c", sources, {"elementary.c": read_runtime("fast.c")}) + read_runtime("in_loop.c")
     return name_apart(_use_fast(text, "lw_any_"), prefix)
 
 
@@ -47,13 +46,8 @@ def own_functions(text: str, prefix: str) -> tuple[str, str]:
     before = prepare_functions(text)
     if not before:
         return "", ""
-    before = INCLUDE.sub(lambda found: runtime(3)[found[1]] + _read("fast.c"), before)
-    after = "".join(f"#undef {name}\n" for name in FUNCTIONS)
-    return name_apart(_use_fast(before, "lw_fast_"), prefix), after
-
-
-def _read(name: str) -> str:
-    return (resources.files(__package__) / "runtime" / name).read_text(encoding="utf-8")
+    before = INCLUDE.sub(lambda found: runtime(3)[found[1]] + read_runtime("fast.c"), before)
+    return name_apart(_use_fast(before, "lw_fast_"), prefix), restore_functions()
 
 
 def _use_fast(text: str, begin: str) -> str:

@@ -11,20 +11,29 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 from html import escape
-from importlib import resources
 
 from ...blocks.core import lay_out
 from .c_code import ORDER, Entry, Kind, _array, _rate, _starts, _table
+from .elementary_tables import read_runtime
 from .html_page import page_of
 from .loop_spec import LoopSpec, Placed, write_unit
 from .model_spec import Variable, naming_convention
 from .quantities import type_names
 from .scalars import _elements
-from .xml_fmi3 import LOG_CATEGORIES, _element, _types, _units_and_types, package_version
+from .xml_fmi2 import simple_types
+from .xml_fmi3 import (
+    _document,
+    _element,
+    _types,
+    _units_and_types,
+    describe_entry,
+    describe_values,
+    log_categories,
+    package_version,
+)
 
 _COMMON = ("model.h", "core.c", "loop.c")
 RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
-_CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}
 
 
 def scalarize_loop(spec: LoopSpec) -> LoopSpec:
@@ -231,8 +240,7 @@ def _labels(spec: LoopSpec) -> Iterator[str]:
 @lru_cache(maxsize=2)
 def loop_runtime(fmi: int) -> dict[str, str]:
     """Return the text of the files that ``model.c`` of a diagram includes, by name."""
-    folder = resources.files(__package__) / "runtime"
-    return {name: (folder / name).read_text(encoding="utf-8") for name in RUNTIME[fmi]}
+    return {name: read_runtime(name) for name in RUNTIME[fmi]}
 
 
 # ---- descriptions ----
@@ -284,28 +292,7 @@ def describe_loop(spec: LoopSpec, token: str, fmi: int) -> str:
 
 
 def _attributes(entry: Entry, one: Placed | None) -> dict[str, object]:
-    v = entry.variable
-    initial = {"fixed": "exact", "tunable": "exact", "state": "exact", "discrete": "exact"}
-    initial |= {"derivative": "calculated", "output": "calculated"}
-    return {
-        "name": entry.name,
-        "valueReference": entry.reference,
-        "description": v.description or None,
-        "causality": _CAUSALITY.get(entry.kind, "output" if entry.is_output else "local"),
-        "variability": _variability(entry.kind, one),
-        "initial": initial.get(entry.kind),
-    }
-
-
-def _limits(entry: Entry, types: dict[str, str]) -> dict[str, object]:
-    v = entry.variable
-    return {
-        "declaredType": types.get(v.unit or ""),
-        "unit": v.unit,
-        "min": None if v.minimum is None else float(v.minimum),
-        "max": None if v.maximum is None else float(v.maximum),
-        "nominal": None if v.nominal is None else float(v.nominal),
-    }
+    return describe_entry(entry, _variability(entry.kind, one))
 
 
 def _experiment(spec: LoopSpec) -> str:
@@ -379,7 +366,7 @@ def _describe3(spec: LoopSpec, token: str) -> str:
         _element(
             "Float64",
             _attributes(entry, one)
-            | _limits(entry, types)
+            | describe_values(entry.variable, types)
             | {"start": " ".join(map(repr, entry.variable.flat_start)) or None}
             | {"clocks": _clock_of(entry, one, clocks), "derivative": entry.of},
             [_element("Dimension", {"start": n}) for n in entry.variable.shape],
@@ -399,16 +386,15 @@ def _describe3(spec: LoopSpec, token: str) -> str:
         }
         structure.append(_element(tag, about))
     structure += [_element("InitialUnknown", {"valueReference": e.reference}) for _, e in _unknowns(entries)]
-    categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
     children = [
         _element("CoSimulation", stepping),
         *_units_and_types(types, [_element("Float64Type", about) for about in _types(types)]),
-        _element("LogCategories", {}, categories),
+        log_categories(3),
         _experiment(spec),
         _element("ModelVariables", {}, variables),
         _element("ModelStructure", {}, structure),
     ]
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
+    return _document("fmiModelDescription", root, children)
 
 
 def _unknowns(entries: tuple[Entry, ...]) -> list[tuple[str, Entry]]:
@@ -475,7 +461,7 @@ def _describe2(spec: LoopSpec, token: str) -> str:
             [
                 _element(
                     "Real",
-                    _limits(entry, types)
+                    describe_values(entry.variable, types)
                     | {"start": entry.variable.flat_start[0] if entry.variable.flat_start else None}
                     | {"derivative": None if entry.of is None else entry.of + 1},
                 )
@@ -498,19 +484,15 @@ def _describe2(spec: LoopSpec, token: str) -> str:
     outputs, rates = listed.values()
     lists = (("Outputs", outputs), ("Derivatives", rates), ("InitialUnknowns", unknown))
     structure = [_element(tag, {}, items) for tag, items in lists if items]
-    simple = [_element("SimpleType", {"name": about.pop("name")}, [_element("Real", about)]) for about in _types(types)]
-    categories = LOG_CATEGORIES | {"logAll": "All of them"}
     children = [
         _element("CoSimulation", stepping, [sources]),
-        *_units_and_types(types, simple),
-        _element(
-            "LogCategories", {}, [_element("Category", {"name": n, "description": d}) for n, d in categories.items()]
-        ),
+        *_units_and_types(types, simple_types(types)),
+        log_categories(2),
         _experiment(spec),
         _element("ModelVariables", {}, variables),
         _element("ModelStructure", {}, structure),
     ]
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
+    return _document("fmiModelDescription", root, children)
 
 
 def loop_page(spec: LoopSpec, text: str = "", *, fmi: int = 3) -> str:

@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from importlib import resources
 from typing import Any
 
 from ...blocks.core import brief, count_of
 from ..runtime import read_sources
-from .elementary_tables import prepare_functions, restore_functions
+from .elementary_tables import prepare_functions, read_runtime, restore_functions
 from .loop_memory import LoopMemory, c_number, c_text
 from .merged_plants import MergedPlant, describe_plants, plant_fields, write_plants
 from .model_spec import Variable
@@ -199,8 +198,7 @@ def write_unit(spec: LoopSpec, *, own_functions: bool = False) -> str:
     """
     code = spec.code
     if own_functions:
-        elementary = (resources.files(__package__) / "runtime" / "elementary.c").read_text(encoding="utf-8")
-        before = prepare_functions(code).replace('#include "elementary.c"\n', elementary)
+        before = prepare_functions(code).replace('#include "elementary.c"\n', read_runtime("elementary.c"))
         code = before + code + restore_functions()
     plants = write_plants(spec.plants)
     return "\n".join([_HEAD, plants, code, read_sources(*_TICKS, *(_BETWEEN if spec.hybrid else ())), *_describe(spec)])

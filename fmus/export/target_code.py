@@ -6,14 +6,13 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from typing import Literal
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import explain_calls
-from .elementary_tables import FUNCTIONS, SINGLE_FUNCTIONS, prepare_functions, prepare_single
+from .elementary_tables import FUNCTIONS, SINGLE_FUNCTIONS, prepare_functions, prepare_single, read_runtime
 from .loop_spec import Placed
 from .model_spec import Variable
 from .scalar_code import OF_MATH, OF_TIME, Expressions, Scalars, Tables, c_constant
@@ -152,10 +151,6 @@ def unit_name(name: str) -> str:
     single = found[:-1] if found[-1] in "fl" else found  # sinf, sinl
     taken = found in _FILE_NAMES or single in _FILE_NAMES or _FILE_NAME.fullmatch(found)
     return f"{found}_" if taken else found
-
-
-def _read_runtime(name: str) -> str:
-    return (resources.files(__package__) / "runtime" / name).read_text(encoding="utf-8")
 
 
 @dataclass
@@ -764,7 +759,7 @@ class _SourceWriter:
         texts = []
         if double:
             text = prepare_functions(" ".join(f"{f}(" for f in double)).replace(
-                '#include "elementary.c"\n', _read_runtime("elementary.c")
+                '#include "elementary.c"\n', read_runtime("elementary.c")
             )
             text = re.sub(r"^#define (\w+) lw_\1\n", "", text, flags=re.MULTILINE)
             text = re.sub(
@@ -773,7 +768,7 @@ class _SourceWriter:
             texts.append(re.sub(r"\b(INFINITY|NAN)\b", r"(double)\1", text))  # they are of single precision in C
         if single:
             texts.append(
-                prepare_single(single).replace('#include "elementary_single.c"\n', _read_runtime("elementary_single.c"))
+                prepare_single(single).replace('#include "elementary_single.c"\n', read_runtime("elementary_single.c"))
             )
         wanted = [*(f"lw_{f}" for f in double), *(f"lw_{f}f" for f in single)]
         text = _leave_out_unused("\n".join(texts), wanted)

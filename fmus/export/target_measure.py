@@ -232,7 +232,6 @@ def _symbols(elf: bytes) -> dict[str, int]:
 # --- a bound ------------------------------------------------------------------------------------------------
 
 _LABEL = re.compile(r"^([\w.$]+):")
-_BRANCH = re.compile(r"^(b\w*(?:\.[nw])?|cbn?z)\s+(?:\w+,\s*)?([\w.$]+)$")
 
 
 def find_bound(assembly: str, function: str) -> tuple[int | None, str]:

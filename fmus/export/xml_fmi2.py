@@ -11,40 +11,34 @@ from .c_code import Entry, layout
 from .model_spec import ModelSpec, naming_convention
 from .quantities import type_names
 from .xml_fmi3 import (
-    _CAUSALITY,
-    _INITIAL,
-    LOG_CATEGORIES,
     Dependency,
+    _document,
     _element,
     _reinitialized_states,
     _types,
     _units_and_types,
     dependencies,
+    describe_entry,
+    describe_values,
+    log_categories,
     package_version,
 )
 
 
 def _variable(e: Entry, reinitialized: set[str], types: Mapping[str, str]) -> str:
     v = e.variable
-    about = {
-        "name": e.name,
-        "valueReference": e.reference,
-        "description": v.description or None,
-        "causality": _CAUSALITY.get(e.kind, "output" if e.is_output else "local"),
-        "variability": "continuous" if e.kind in ("time", "derivative") else v.variability,
-        "initial": _INITIAL.get(e.kind),
-    }
-    real = {
-        "declaredType": types.get(v.unit or ""),
-        "unit": v.unit,
-        "min": None if v.minimum is None else float(v.minimum),
-        "max": None if v.maximum is None else float(v.maximum),
-        "nominal": None if v.nominal is None else float(v.nominal),
+    about = describe_entry(e, "continuous" if e.kind in ("time", "derivative") else v.variability)
+    real = describe_values(v, types) | {
         "start": v.flat_start[0] if v.flat_start else None,
         "derivative": None if e.of is None else _index(e.of),
         "reinit": True if e.kind == "state" and e.name in reinitialized else None,
     }
     return _element("ScalarVariable", about, [_element("Real", real)])
+
+
+def simple_types(types: Mapping[str, str]) -> list[str]:
+    """Return the elements of the definitions of types."""
+    return [_element("SimpleType", {"name": about.pop("name")}, [_element("Real", about)]) for about in _types(types)]
 
 
 def _index(reference: int) -> int:
@@ -123,8 +117,6 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
     }
     sources = _element("SourceFiles", {}, [_element("File", {"name": "model.c"})])
     types = type_names(entries)
-    simple = [_element("SimpleType", {"name": about.pop("name")}, [_element("Real", about)]) for about in _types(types)]
-    categories = LOG_CATEGORIES | {"logAll": "All of them"}
     experiment = {
         "startTime": 0.0,
         "stopTime": float(spec.stop_time),
@@ -135,12 +127,10 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
     children = [
         _element("ModelExchange", both | {"completedIntegratorStepNotNeeded": True}, [sources]),
         _element("CoSimulation", both | stepping, [sources]),
-        *_units_and_types(types, simple),
-        _element(
-            "LogCategories", {}, [_element("Category", {"name": n, "description": d}) for n, d in categories.items()]
-        ),
+        *_units_and_types(types, simple_types(types)),
+        log_categories(2),
         _element("DefaultExperiment", experiment),
         _element("ModelVariables", {}, [_variable(e, reinitialized, types) for e in entries]),
         _element("ModelStructure", {}, _structure(spec, entries)),
     ]
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
+    return _document("fmiModelDescription", root, children)

@@ -16,7 +16,7 @@ import casadi as ca
 
 from ...blocks.core import BASE_UNITS, Layout, parse_unit
 from .c_code import Entry, expand_scalar, layout, to_symbols
-from .model_spec import ModelSpec, naming_convention
+from .model_spec import ModelSpec, Variable, naming_convention
 from .quantities import quantity, type_names
 
 #: Log categories (FMI 3.0, 2.4.5) that the runtime uses.
@@ -50,6 +50,18 @@ def _element(tag: str, attributes: Mapping[str, object], children: Iterable[str]
     text = "".join(f" {name}={quoteattr(_text(value))}" for name, value in attributes.items() if value is not None)
     inner = [f"  {line}" for child in children for line in child.splitlines()]
     return "\n".join([f"<{tag}{text}>", *inner, f"</{tag}>"]) if inner else f"<{tag}{text}/>"
+
+
+def _document(tag: str, attributes: Mapping[str, object], children: Iterable[str]) -> str:
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{_element(tag, attributes, children)}\n'
+
+
+def log_categories(fmi: int) -> str:
+    """Return the element of the log categories; FMI 2.0 has one for all of them, too."""
+    found = LOG_CATEGORIES | ({"logAll": "All of them"} if fmi == 2 else {})
+    return _element(
+        "LogCategories", {}, [_element("Category", {"name": n, "description": d}) for n, d in found.items()]
+    )
 
 
 def _text(value: object) -> str:
@@ -182,21 +194,36 @@ _INITIAL = dict.fromkeys(("fixed", "tunable", "state", "discrete"), "exact")
 _INITIAL |= dict.fromkeys(("derivative", "output", "indicator"), "calculated")
 
 
-def _variable(e: Entry, reinitialized: set[str], types: Mapping[str, str]) -> str:
-    v = e.variable
-    attributes: dict[str, object] = {
+def describe_entry(e: Entry, variability: str) -> dict[str, object]:
+    """Return the attributes that a variable has in both versions of FMI, whatever its type."""
+    return {
         "name": e.name,
         "valueReference": e.reference,
-        "description": v.description or None,
+        "description": e.variable.description or None,
         "causality": _CAUSALITY.get(e.kind, "output" if e.is_output else "local"),
-        "variability": "continuous" if e.kind in ("time", "derivative") else v.variability,
+        "variability": variability,
         "initial": _INITIAL.get(e.kind),
-        "intermediateUpdate": True if (e.kind == "input" or e.is_output) and v.variability == "continuous" else None,
+    }
+
+
+def describe_values(v: Variable, types: Mapping[str, str]) -> dict[str, object]:
+    """Return the attributes of a real variable in both versions of FMI: type, unit, range, nominal value."""
+    return {
         "declaredType": types.get(v.unit or ""),
         "unit": v.unit,
         "min": None if v.minimum is None else float(v.minimum),
         "max": None if v.maximum is None else float(v.maximum),
         "nominal": None if v.nominal is None else float(v.nominal),
+    }
+
+
+def _variable(e: Entry, reinitialized: set[str], types: Mapping[str, str]) -> str:
+    v = e.variable
+    variability = "continuous" if e.kind in ("time", "derivative") else v.variability
+    attributes = describe_entry(e, variability) | {
+        "intermediateUpdate": True if (e.kind == "input" or e.is_output) and v.variability == "continuous" else None,
+    }
+    attributes |= describe_values(v, types) | {
         "start": " ".join(map(repr, v.flat_start)) or None,
         "derivative": e.of,
         "reinit": True if e.kind == "state" and e.name in reinitialized else None,
@@ -265,22 +292,20 @@ def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
     }
     reinitialized = _reinitialized_states(spec)
     types = type_names(entries)
-    categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
     children = [
         _element("ModelExchange", both | {"needsCompletedIntegratorStep": False}),
         _element("CoSimulation", both | stepping),
         *_units_and_types(types, [_element("Float64Type", about) for about in _types(types)]),
-        _element("LogCategories", {}, categories),
+        log_categories(3),
         _element("DefaultExperiment", experiment),
         _element("ModelVariables", {}, [_variable(e, reinitialized, types) for e in entries]),
         _element("ModelStructure", {}, _structure(spec, entries)),
     ]
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
+    return _document("fmiModelDescription", root, children)
 
 
 def build_description(name: str) -> str:
     """Return the text of ``sources/buildDescription.xml`` (FMI 3.0, 2.5.1.3) of a model, with one file to compile."""
     files = _element("SourceFileSet", {"language": "C11"}, [_element("SourceFile", {"name": "model.c"})])
     configuration = _element("BuildConfiguration", {"modelIdentifier": name}, [files])
-    root = _element("fmiBuildDescription", {"fmiVersion": "3.0"}, [configuration])
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n{root}\n'
+    return _document("fmiBuildDescription", {"fmiVersion": "3.0"}, [configuration])
