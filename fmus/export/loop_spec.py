@@ -100,7 +100,7 @@ class Slopes:
 
 @dataclass(frozen=True)
 class ComputedNumbers:
-    """ComputedNumbers that are computed from the parameters of a block, behind these.
+    """Numbers that are computed from the parameters of a block, behind these.
 
     ``first``, ``parameters``, ``count``: entry of p with which the block's parameters begin, their number, and that of
     the computed numbers.
