@@ -11,7 +11,8 @@ import numpy as np
 
 from ...blocks.called_back import CalledBack
 from ...blocks.core import LoopwrightError
-from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, QuietStep, RemoteStep, SharedValues
+from ...fmus.calls import ERROR, BoundCalls, QuietStep, RemoteStep, SharedValues
+from ...fmus.isolation import ChildProcess, ChildRequest
 from .bound_functions import at
 from .runtime import load_runtime
 
@@ -74,7 +75,7 @@ class RemotePlants:
 
     def __init__(self) -> None:
         self.structure = _Apart()
-        self._all: list[tuple[ChildFace, RemoteStructure]] = []
+        self._all: list[tuple[ChildProcess, RemoteStructure]] = []
         self._kept: list[Any] = []
         self.by_python: PythonSteps | None = None
         """Steps that Python takes; None if there are none."""
@@ -191,7 +192,7 @@ class RemotePlants:
 
 
 @contextmanager
-def _lend(far: tuple[ChildFace, RemoteStructure] | None) -> Iterator[None]:
+def _lend(far: tuple[ChildProcess, RemoteStructure] | None) -> Iterator[None]:
     """Let Python make the requests to a process meanwhile: it numbers them on."""
     if far is None:
         yield
@@ -212,10 +213,10 @@ class PythonSteps(CalledBack):
 
     def __init__(self) -> None:
         super().__init__()
-        self._steps: dict[int, tuple[PythonStep, tuple[ChildFace, RemoteStructure] | None]] = {}
+        self._steps: dict[int, tuple[PythonStep, tuple[ChildProcess, RemoteStructure] | None]] = {}
         self.step = self.function(_STEP, self._take, 1)
 
-    def add(self, place: int, step: PythonStep, far: tuple[ChildFace, RemoteStructure] | None) -> None:
+    def add(self, place: int, step: PythonStep, far: tuple[ChildProcess, RemoteStructure] | None) -> None:
         """Take the steps of a plant, and the requests to its process that are C's in other steps."""
         self._steps[place] = step, far
 
@@ -253,7 +254,7 @@ class LateReplies(CalledBack):
         """End a process at an interrupt before the wait; one within the wait ends it there."""
         self._find(place)[1].give_up()
 
-    def _find(self, place: int) -> tuple[BoundCalls, ChildFace]:
+    def _find(self, place: int) -> tuple[BoundCalls, ChildProcess]:
         structure, asked = self._asked[place]
         calls = asked[structure.sequence]
         assert calls.request is not None

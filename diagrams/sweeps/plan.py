@@ -14,7 +14,7 @@ import numpy as np
 
 from ...blocks.core import Layout, LoopwrightError, SimulationError
 from ...fmus import Fmu
-from ...fmus.isolation import find_limits
+from ...fmus.calls import find_limits
 from ...fmus.platform import is_built_here
 from ..flat import WiredDiagram
 from ..results import Run

@@ -1,11 +1,12 @@
-"""FMI calls into a library that is loaded in this process."""
+"""FMI calls into a library that is loaded in this process or in another one."""
 
-from .bound_calls import BoundCalls, Call, ChildFace, ChildRequest
+from .bound_calls import BoundCalls, Call
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .library_functions import LibraryFunctions, exported_name, list_prototypes
-from .loaded_library import CALLS, LoadedFmu
+from .loaded_library import LoadedFmu
+from .loading import find_limits
 from .model_exchange_instance import ModelExchangeInstance
 from .model_structure import is_smooth
 from .native_actions import NativeAction, NativeLook
@@ -16,14 +17,11 @@ from .step_options import StepOptions, StepTime, check_offered
 from .transfer import is_kept
 
 __all__ = [
-    "CALLS",
     "ERROR",
     "NEAR",
     "WARNING",
     "BoundCalls",
     "Call",
-    "ChildFace",
-    "ChildRequest",
     "FmiCalls",
     "FmuBlock",
     "FmuInstance",
@@ -42,6 +40,7 @@ __all__ = [
     "StepTime",
     "check_offered",
     "exported_name",
+    "find_limits",
     "is_kept",
     "is_smooth",
     "list_prototypes",

@@ -3,47 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any
+
+from ..isolation import ChildRequest
 
 Call = tuple[Callable[..., int], tuple[Any, ...]]
 """A C function, and its arguments."""
 STATUS = ("OK", "warning", "discard", "error", "fatal", "pending")
 WARNING, DISCARD, ERROR, FATAL, PENDING = range(1, 6)
 """Statuses of FMI's functions (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)."""
-
-
-class ChildFace(Protocol):
-    """A process that runs calls of a library: `ChildProcess` of the package above, which this one can't import."""
-
-    name: str
-    number: int
-    arrived: bool
-    alive: bool
-    used: bool
-
-    def check_alive(self, call: str) -> None:
-        """Raise the error of a process that has ended before a call."""
-
-    def give_up(self) -> None:
-        """End the process after an interrupt in a call."""
-
-    def collect(self) -> int:
-        """Take the log messages of a request whose reply is there, and return its status."""
-
-    def run_in_c(self, library: str) -> None:
-        """Let a library wait for requests and make bound calls there, where it can."""
-
-
-class ChildRequest(NamedTuple):
-    """Calls in another process: who runs them, by which words in shared memory, and which pipes."""
-
-    process: ChildFace
-    sequence: int  # number of the calls
-    words: int  # address of the words
-    commands: int  # pipe that wakes the process
-    replies: int  # pipe by which it wakes this one
-    ordered: bool  # False where each request and reply is announced in the pipes
-    looks: int  # most looks at a reply before one sleeps
 
 
 class BoundCalls:

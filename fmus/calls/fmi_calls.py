@@ -19,10 +19,10 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from ...blocks.core import FmuProcessError
+from ..isolation import Logger, format_message
 from .bound_calls import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING, BoundCalls, Call
 from .event_calls import EventCalls, EventUpdate
 from .library_functions import LibraryFunctions, allow_missing, exported_name
-from .printf import Logger, format_message
 
 __all__ = ["DISCARD", "ERROR", "FATAL", "PENDING", "STATUS", "WARNING", "FmiCalls"]
 

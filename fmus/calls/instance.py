@@ -8,7 +8,6 @@ from contextlib import nullcontext
 import numpy as np
 
 from .fmu_block import FmuBlock
-from .loaded_library import MakeCalls
 from .native_step import NativeStep, RemoteStep
 from .saved_state import FmuState
 from .step import InstanceStep, StepMemory
@@ -37,8 +36,8 @@ class FmuInstance(StepFailures):
     finish_remote: Callable[[float, float], None]
     """End a step from t over h, both in s, that a loop in C has begun in another process."""
 
-    def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
-        super().__init__(block, wired, make_calls=make_calls)
+    def __init__(self, block: FmuBlock, wired: Sequence[str]):
+        super().__init__(block, wired)
         self._outputs = dict(block.output_variables)
         self._step: InstanceStep | None = None
         self.read = lambda t: None

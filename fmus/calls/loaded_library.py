@@ -1,4 +1,4 @@
-"""Library of an FMU, loaded in this process, with one instance."""
+"""Library of an FMU, loaded in this process or in another one, with one instance."""
 
 from __future__ import annotations
 
@@ -22,20 +22,15 @@ from ...blocks.core import (
 from ..archive import FmuFault, FmuVariable, inexact, unpack
 from ..host_state import FOLDER, HostState
 from ..platform import is_built_here
-from .fmi1 import Fmi1Calls
-from .fmi2 import Fmi2Calls
-from .fmi3 import Fmi3Calls
-from .fmi_calls import FATAL, FmiCalls
+from .fmi_calls import FATAL
 from .fmu_block import FmuBlock
+from .loading import find_limits, load_calls
 from .message_log import MessageLog, clean_text, describe_end
 from .model_exchange_calls import order_questions
 from .step_options import choose_modes
 from .text_values import is_readable, list_limits, read_text, waits_for_initialization, write_text
 from .transfer import BoundReading, BoundStart, is_kept
 
-CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
-"""Functions by the major version of FMI."""
-MakeCalls = Callable[..., FmiCalls]
 R = TypeVar("R")
 _SET = ("parameter", "input", "structuralParameter")
 _OPEN: WeakSet[LoadedFmu] = WeakSet()
@@ -43,9 +38,9 @@ _OPEN: WeakSet[LoadedFmu] = WeakSet()
 
 
 class LoadedFmu:
-    """Instance of an FMU: log, initialization, variables, end; ``make_calls`` makes its functions, else here."""
+    """Instance of an FMU: log, initialization, variables, end."""
 
-    def __init__(self, block: FmuBlock, *, model_exchange: bool = False, make_calls: MakeCalls | None = None):
+    def __init__(self, block: FmuBlock, *, model_exchange: bool = False):
         self.block, self.description = block, block.description
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
         self.log = MessageLog(block.label, list_limits(block.label, self.description, model_exchange=model_exchange))
@@ -53,9 +48,9 @@ class LoadedFmu:
         self._start: BoundStart | None = None
         self._began, self._given, self.is_built_here = 0.0, dict[str, Any](), is_built_here(self.description.digest)
         description, self.host = self.description, HostState(self.add_note)
-        if make_calls is None:
+        limits, exchange = find_limits(block), description.exchange
+        if limits is None:
             self._refuse_second()
-        make, exchange = make_calls or CALLS[description.fmi[0]], description.exchange
         library = exchange.binary if model_exchange and exchange is not None else description.binary
         try:
             files = unpack(description)
@@ -63,9 +58,11 @@ class LoadedFmu:
             error.at(block=block.label)
             raise
         # FMPy stays in the binary's folder if loading fails, too; another process has its own folder
-        with FOLDER if make_calls is None else nullcontext(), self.host:
+        with FOLDER if limits is None else nullcontext(), self.host:
             try:
-                self.fmi = make(
+                self.fmi = load_calls(
+                    block,
+                    limits,
                     name=block.label,
                     token=description.token,
                     folder=files,

@@ -17,7 +17,6 @@ from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
 from .event_calls import EventUpdate
 from .fmi_calls import MOST_ROUNDS
 from .fmu_block import FmuBlock, check_next_time
-from .loaded_library import MakeCalls
 from .model_exchange_calls import Evaluation, Vector, call_actions
 from .model_structure import check_structure, is_smooth
 from .native_actions import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
@@ -44,8 +43,8 @@ class ModelExchangeInstance(RunningFmu):
     time of its next time event in s, infinite without one.
     """
 
-    def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
-        super().__init__(block, wired, model_exchange=True, make_calls=make_calls)
+    def __init__(self, block: FmuBlock, wired: Sequence[str]):
+        super().__init__(block, wired, model_exchange=True)
         assert block.model_exchange_info is not None
         self.about: ModelExchangeInfo = block.model_exchange_info
         self._ports = dict(block.input_variables)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..host_state import HostState
-from .bound_calls import ChildRequest
+from ..isolation import ChildRequest
 from .transfer import Transfer
 
 

@@ -11,7 +11,7 @@ from ...blocks.core import FmuRuntimeError, SimulationError
 from ..archive import FmuVariable
 from .bound_calls import WARNING
 from .fmu_block import FmuBlock
-from .loaded_library import LoadedFmu, MakeCalls
+from .loaded_library import LoadedFmu
 from .text_values import Text, TextRecord
 from .transfer import OutOfRangeError, Transfer, UnfitError
 
@@ -36,15 +36,8 @@ class RunningFmu(LoadedFmu):
     ends_run = is_trial = False
     refused: SimulationError | None = None
 
-    def __init__(
-        self,
-        block: FmuBlock,
-        wired: Sequence[str],
-        *,
-        model_exchange: bool = False,
-        make_calls: MakeCalls | None = None,
-    ):
-        super().__init__(block, model_exchange=model_exchange, make_calls=make_calls)
+    def __init__(self, block: FmuBlock, wired: Sequence[str], *, model_exchange: bool = False):
+        super().__init__(block, model_exchange=model_exchange)
         variables = block.input_variables
         self.inputs = {port: variables[port] for port in wired}
         self.record = TextRecord(self.fmi, block.text_variables)

@@ -10,15 +10,14 @@ from typing import Any
 from ...blocks.core import FmuError, explain_calls
 from ..platform import native_platform
 from .fmu_block import FmuBlock
-from .loaded_library import MakeCalls
 from .running_fmu import RunningFmu
 
 
 class SavingFmu(RunningFmu):
     """Instance whose states can be saved and restored, where the FMU offers that: `can_save`, `can_serialize`."""
 
-    def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
-        super().__init__(block, wired, make_calls=make_calls)
+    def __init__(self, block: FmuBlock, wired: Sequence[str]):
+        super().__init__(block, wired)
         self._handles: dict[int, Any] = {}
         self.final = self.fmi.final  # noSetFMUStatePriorToCurrentPoint, until a state has been saved
 

@@ -11,7 +11,6 @@ import numpy as np
 from ...blocks.core import FmuProcessError, FmuRuntimeError
 from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, StepCall
 from .fmu_block import FmuBlock
-from .loaded_library import MakeCalls
 from .saved_state import FmuState, SavingFmu
 from .transfer import Transfer, UnfitError
 
@@ -38,8 +37,8 @@ class StepFailures(SavingFmu):
     on_end: Callable[[], None] | None = None
     _has_retried = _has_been_off = False
 
-    def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
-        super().__init__(block, wired, make_calls=make_calls)
+    def __init__(self, block: FmuBlock, wired: Sequence[str]):
+        super().__init__(block, wired)
         self.vector = np.zeros(0)
         """Values of all inputs."""
         self.now, self.width = self.fmi.variable(ctypes.c_double), self.fmi.variable(ctypes.c_double)

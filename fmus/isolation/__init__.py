@@ -1,13 +1,23 @@
-"""FMUs in their own processes: the face of `fmus/calls`, with the library in a child."""
+"""A child process that holds the library of an FMU: requests, shared memory, watchdog, end."""
 
-from .opening import find_limits, open_fmu
-from .pool import count_processes, end_idle
-from .process_limits import Isolation
+from .endings import describe_memory
+from .fmu_process import ChildProcess, ChildRequest
+from .pool import count_processes, end_idle, give_back, take
+from .printf import Logger, format_message
+from .process_limits import Isolation, default_memory
+from .wire import WATCH_TEXTS
 
 __all__ = [
+    "WATCH_TEXTS",
+    "ChildProcess",
+    "ChildRequest",
     "Isolation",
+    "Logger",
     "count_processes",
+    "default_memory",
+    "describe_memory",
     "end_idle",
-    "find_limits",
-    "open_fmu",
+    "format_message",
+    "give_back",
+    "take",
 ]

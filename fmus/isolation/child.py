@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import _ctypes
 import ctypes
-import importlib
 import json
 import mmap
 import os
@@ -20,7 +19,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from . import wire
+from . import printf, wire
 from .in_c import TYPES, Server, make_watch
 from .surroundings import forget, has_room, kill_group, limit, look_around, move, print_to, resident
 from .wire import (
@@ -66,7 +65,6 @@ class Child:
         self.bound: list[list[tuple[Any, list[tuple[str, Any]]]]] = []
         self.server: Server | None = None
         """Waits for requests in C; None before `do_run_in_c`."""
-        self.printf = importlib.import_module(".printf", __package__)
         self.before: list[Any] = []
         self.line: Any = None
         """Inputs that follow lines within a step: start, status, values and slopes, then references, instance."""
@@ -321,11 +319,11 @@ class Child:
 
         def message(environment: Any, name: Any, status: int, category: Any, text: bytes | None, *more: Any) -> None:
             if status:
-                self._keep_message(status, self.printf.format_message(text or b"", more))
+                self._keep_message(status, printf.format_message(text or b"", more))
 
         c_library = ctypes.CDLL(None) if sys.platform != "win32" else ctypes.cdll.msvcrt
         calloc, free = (ctypes.cast(getattr(c_library, n), ctypes.c_void_p).value for n in ("calloc", "free"))
-        logger = self._keep(self.printf.Logger(message))
+        logger = self._keep(printf.Logger(message))
         address = ctypes.cast(logger, ctypes.c_void_p).value
         callbacks = self._keep((ctypes.c_void_p * 5)(address, calloc, free, None, None))
         if version == 1:

@@ -14,12 +14,11 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
 from ...blocks.core import FmuEnd, FmuError, FmuProcessError, describe_disk_error
-from ..calls import ChildRequest, printf
 from ..child_processes import ProcessGroup, find_python, make_temporary_folder, remove_folder
 from . import wire
 from .endings import copy_files, count_cores, read_end
@@ -28,11 +27,23 @@ from .wire import CAUSE, CHILD_SLEEPS, DATA, MAIL, MESSAGES, PARENT_SLEEPS, PLAC
 
 _START = (
     "import sys, types; sys.path[:] = [p for p in sys.path if p]; m = types.ModuleType('loopwright_child'); "
-    "m.__path__ = sys.argv[1:3]; sys.modules[m.__name__] = m; from loopwright_child.child import main; main()"
+    "m.__path__ = sys.argv[1:2]; sys.modules[m.__name__] = m; from loopwright_child.child import main; main()"
 )
 _LOOKS = 2000
 _LOOK = 0.05  # s between two looks at a process that does not answer
 _LOADING = 60.0  # s to load a small library of ours
+
+
+class ChildRequest(NamedTuple):
+    """Calls that a child makes at the request of C: the child, the words in shared memory, and the pipes."""
+
+    process: ChildProcess
+    sequence: int  # number of the calls
+    words: int  # address of the words
+    commands: int  # pipe that wakes the process
+    replies: int  # pipe by which it wakes this one
+    ordered: bool  # False where each request and reply is announced in the pipes
+    looks: int  # most looks at a reply before one sleeps
 
 
 class ChildProcess:
@@ -90,7 +101,7 @@ class ChildProcess:
             "files": str(self.folder / "fmu"),
             **{name: str(self.folder / name) for name in ("shared", "log", "printed", "mail")},
         }
-        here = [str(Path(__file__).parent), str(Path(printf.__file__).parent), json.dumps(about)]
+        here = [str(Path(__file__).parent), json.dumps(about)]
         with open(self.folder / "printed", "wb") as printed:
             self._process = self._group.start(
                 [find_python(), "-c", _START, *here],

@@ -25,7 +25,7 @@ from ..archive import (
     kept_description,
 )
 from ..calls import FmuInstance, StepOptions, check_offered
-from ..isolation import Isolation, open_fmu
+from ..isolation import Isolation
 from .fmu_point import FmuLinearization
 from .fmu_start_values import check_start, check_value, read_sized
 from .linearization import STEP, linear_model, step_difference
@@ -362,7 +362,7 @@ class Fmu(ModelExchangeMembers):
         start_time : float
             Start of the run in s.
         """
-        instance = open_fmu(FmuInstance, self, wired)  # it reads the description, and so checks the file
+        instance = FmuInstance(self, wired)  # it reads the description, and so checks the file
         try:
             instance.initialize(stop_time, start_time=start_time)
             yield instance

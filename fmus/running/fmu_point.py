@@ -11,7 +11,6 @@ import numpy as np
 
 from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, explain_calls, near
 from ..calls import FmuBlock, LoadedFmu, is_kept
-from ..isolation import open_fmu
 from .derivation import Derivation
 from .fmu_start_values import check_state, check_value
 
@@ -179,7 +178,7 @@ class FmuPoint:
 @contextmanager
 def initialize_at(point: FmuPoint, exchange: bool) -> Iterator[LoadedFmu]:
     """Load the FMU and enter Initialization Mode at the operating point."""
-    instance = open_fmu(LoadedFmu, point.block, model_exchange=exchange)
+    instance = LoadedFmu(point.block, model_exchange=exchange)
     try:
         instance.initialize(None, start_time=point.t, values=_exact(point, {}))
         yield instance

@@ -13,7 +13,6 @@ from ...blocks.core import Array, Event, FmuFileError, State
 from ...blocks.tracing import NEXT
 from ..archive import FmuDescription, FmuVariable, ModelExchangeInfo
 from ..calls import ModelExchangeInstance, StepOptions, is_smooth
-from ..isolation import open_fmu
 from ..platform import is_built_here
 from .port_members import PortMembers
 
@@ -162,7 +161,7 @@ class ModelExchangeMembers(PortMembers):
         start_time : float
             Start of the run in s.
         """
-        instance = open_fmu(ModelExchangeInstance, self, wired)
+        instance = ModelExchangeInstance(self, wired)
         try:
             instance.initialize(None, start_time=start_time)
             instance.add_note(f"it runs {self.interface_text}: the solver integrates it")

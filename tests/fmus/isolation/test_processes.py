@@ -17,7 +17,8 @@ from loopwright.blocks import ParameterError
 from loopwright.blocks.core import Wanted
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, FmuProcessError, FmuRuntimeError, Isolation
-from loopwright.fmus.isolation import count_processes, end_idle, find_limits
+from loopwright.fmus.calls import find_limits
+from loopwright.fmus.isolation import count_processes, end_idle
 from loopwright.types import FmuEnd
 from support.exported import mass_spring_damper
 from support.waiting import Interruption, wait_for
@@ -341,11 +342,10 @@ def test_what_an_fmu_prints_is_told_at_the_end(folder):
 
 def test_the_child_imports_the_standard_library_only():
     """It is a second of NumPy, CasADi and FMPy faster so."""
-    from loopwright.fmus.calls import printf
     from loopwright.fmus.isolation import fmu_process
 
-    begin = fmu_process._START.replace("; main()", "; import loopwright_child.printf; print(*sys.modules)")
-    here = [str(Path(module.__file__).parent) for module in (fmu_process, printf)]
+    begin = fmu_process._START.replace("; main()", "; print(*sys.modules)")
+    here = [str(Path(fmu_process.__file__).parent)]
     done = subprocess.run([sys.executable, "-c", begin, *here], capture_output=True, text=True, check=True)
     assert "loopwright_child.child" in done.stdout.split()
     assert not {"numpy", "casadi", "fmpy", "loopwright", "scipy"} & set(done.stdout.split())

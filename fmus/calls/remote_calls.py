@@ -11,25 +11,11 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuError
-from ..calls import (
-    CALLS,
-    ERROR,
-    WARNING,
-    BoundCalls,
-    Call,
-    ChildRequest,
-    FmiCalls,
-    LibraryFunctions,
-    Log,
-    exported_name,
-    list_prototypes,
-)
-from . import wire
-from .endings import describe_memory
-from .fmu_process import ChildProcess
-from .library import RemoteLibrary, describe_call, seconds_for
-from .pool import give_back
-from .process_limits import Isolation
+from ..isolation import WATCH_TEXTS, ChildProcess, ChildRequest, Isolation, describe_memory, give_back
+from .bound_calls import ERROR, WARNING, BoundCalls, Call
+from .fmi_calls import FmiCalls, Log, call_error_type
+from .library_functions import LibraryFunctions, exported_name, list_prototypes
+from .remote_library import RemoteLibrary, describe_call, seconds_for
 
 
 class RemoteBoundCalls(BoundCalls):
@@ -81,7 +67,7 @@ class RemoteBoundCalls(BoundCalls):
 class RemoteWatch:
     """The child's own function among bound calls that notes whether texts have changed; it is bound, never called."""
 
-    name = wire.WATCH_TEXTS
+    name = WATCH_TEXTS
 
     def __call__(self, *arguments: object) -> int:
         """Refuse."""
@@ -93,8 +79,13 @@ class RemoteCalls(FmiCalls):
 
     in_process = False
     text_watch = staticmethod(RemoteWatch())
-    process: ChildProcess
-    limits: Isolation
+
+    def __init__(self, *, process: ChildProcess, limits: Isolation, library: Path, **arguments: Any):
+        """Load a library in a child; the others are arguments of `FmiCalls`."""
+        self.process, self.limits, self.patience = process, limits, limits.step_time
+        self._path, self._unloaded = library, False
+        self._freed: deque[Any] = deque()
+        super().__init__(library=library, **arguments)
 
     def _open(self, kind: Any, required: tuple[str, ...], **arguments: Any) -> Any:
         """Return an object of FMPy's class whose library is in the child."""
@@ -159,8 +150,6 @@ class RemoteCalls(FmiCalls):
 
     def set_binaries(self, references: Sequence[int], values: Sequence[bytes]) -> None:
         """Set binary data, from memory of the child."""
-        from fmpy.fmi1 import FMICallException
-
         arguments = [self.fmu.component, list(references), [len(v) for v in values]]
         status = self.process.request(
             "set_bytes",
@@ -171,7 +160,7 @@ class RemoteCalls(FmiCalls):
             seconds=self.limits.step_time,
         )[0]
         if status > WARNING:
-            raise FMICallException("fmi3SetBinary", status)
+            raise call_error_type()("fmi3SetBinary", status)
 
     def _follow(self, line: np.ndarray, references: Sequence[int], n: int) -> None:
         """Let the child set inputs from a line when the FMU asks for that; see `Fmi3Calls.slope_line`."""
@@ -190,26 +179,3 @@ class RemoteCalls(FmiCalls):
     def end(self) -> None:
         """Keep the process for another instance, or end it."""
         give_back(self.process, self._unloaded)
-
-    def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
-        self._path, self._unloaded = library, False
-        self._freed: deque[Any] = deque()
-        super().__init__(name=name, token=token, folder=folder, library=library, model_exchange=model_exchange)
-
-
-def make_remote_calls(version: str, process: ChildProcess, limits: Isolation, **arguments: Any) -> FmiCalls:
-    """Make the calls of a major version of FMI with the library in a child, which is given back if that fails."""
-    base = CALLS[version]
-    kind = type(
-        f"Remote{base.__name__}",
-        (RemoteCalls, base),
-        {"process": process, "limits": limits, "patience": limits.step_time},
-    )
-    source, folder = Path(arguments["folder"]), process.folder / "fmu"
-    library = folder / Path(arguments["library"]).relative_to(source)
-    try:
-        calls: FmiCalls = kind(**{**arguments, "folder": folder, "library": library})
-    except BaseException:
-        give_back(process, False)
-        raise
-    return calls

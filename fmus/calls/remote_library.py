@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..calls import ERROR
-from .fmu_process import ChildProcess
-from .process_limits import Isolation
+from ..isolation import ChildProcess, Isolation
+from .bound_calls import ERROR
 
 _FUNCTION: Any = ctypes._CFuncPtr  # type: ignore[attr-defined]
 _CALLBACKS = {"fmi1CallbackFunctions": 1, "fmi2CallbackFunctions": 2}
