@@ -13,56 +13,14 @@ from ...blocks.core import OptionError, explain_disk_errors
 from ..exporting import to_c
 from ..paper import Experiment
 from ..wiring import Subsystem
+from .arguments import as_json
+from .command import Command, argument, flag, several
 from .subjects import find_diagram
-from .text import add_json, say, say_json
+from .text import say, say_json
 from .user_models import load_user_file
 
 
-def add_c(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``c`` to the parser of `main`."""
-    parser = commands.add_parser(
-        "c",
-        help="write a sampled diagram or subsystem as C for a target",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Write a sampled diagram or subsystem as C for a target: a header, a source of standard C99\n"
-        "without allocation, an example, and a report of what each tick touches. No compiler is needed.\n\n"
-        "MODEL is FILE.py:NAME: a diagram in a file of yours, a function that returns one, or a function with\n"
-        "@subsystem, whose arguments become inputs.",
-        epilog="examples:\n  loopwright c loop.py:controller --out target\n"
-        "  loopwright c loop.py:loop --subsystem controller --number float --out target\n"
-        "  loopwright c loop.py:loop --outside plant --measure --test signal.csv\n\n"
-        "exit status:\n  0    done\n  1    it can't be C for a target, or the measurement failed\n"
-        "  2    wrong usage; nothing is written\n  130  interrupted (Ctrl-C)",
-    )
-    parser.add_argument("model", metavar="MODEL", help="FILE.py:NAME")
-    parser.add_argument("--out", metavar="DIR", default=".", help="folder for the files (default: the current folder)")
-    parser.add_argument("--name", help="begin of all names in the C code (default: the subsystem's or diagram's)")
-    parser.add_argument("--subsystem", metavar="PATH", help="write this subsystem of the diagram alone")
-    parser.add_argument(
-        "--outside",
-        metavar="PATH",
-        nargs="+",
-        action="extend",
-        default=[],
-        help="blocks of the diagram that are not written, such as the plant",
-    )
-    parser.add_argument("--outputs", metavar="NAME", nargs="+", action="extend", help="signals that are outputs")
-    parser.add_argument("--number", choices=("double", "float"), default="double", help="type of numbers")
-    parser.add_argument(
-        "--own-functions", action="store_true", help="elementary functions of Loopwright in place of math.h's"
-    )
-    parser.add_argument(
-        "--measure", action="store_true", help="compile it for Cortex-M4 and M0, and count the instructions of ticks"
-    )
-    parser.add_argument(
-        "--test",
-        metavar="FILE.csv",
-        help="test signal for --measure: a column for each input, such as force or force[1]; a row for each tick",
-    )
-    add_json(parser, "the files and the report")
-
-
-def c_command(arguments: argparse.Namespace) -> int:
+def _c(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright c``."""
     if arguments.test and not arguments.measure:
         raise OptionError("it is for --measure. Give both, or none.", port="--test")
@@ -115,3 +73,42 @@ def _read_signal(path: Path) -> dict[str, np.ndarray]:
         columns.setdefault(name.strip().partition("[")[0], []).append(i)
     vectors = {name.strip().partition("[")[0] for name in rows[0] if "[" in name}
     return {n: table[:, at] if n in vectors else table[:, at[0]] for n, at in columns.items()}
+
+
+C = Command(
+    name="c",
+    help="write a sampled diagram or subsystem as C for a target",
+    description="Write a sampled diagram or subsystem as C for a target: a header, a source of standard C99\n"
+    "without allocation, an example, and a report of what each tick touches. No compiler is needed.\n\n"
+    "MODEL is FILE.py:NAME: a diagram in a file of yours, a function that returns one, or a function with\n"
+    "@subsystem, whose arguments become inputs.",
+    examples=(
+        "c loop.py:controller --out target",
+        "c loop.py:loop --subsystem controller --number float --out target",
+        "c loop.py:loop --outside plant --measure --test signal.csv",
+    ),
+    exit_status={
+        0: "done",
+        1: "it can't be C for a target, or the measurement failed",
+        2: "wrong usage; nothing is written",
+        130: "interrupted (Ctrl-C)",
+    },
+    arguments=(
+        argument("model", metavar="MODEL", help="FILE.py:NAME"),
+        argument("--out", metavar="DIR", default=".", help="folder for the files (default: the current folder)"),
+        argument("--name", help="begin of all names in the C code (default: the subsystem's or diagram's)"),
+        argument("--subsystem", metavar="PATH", help="write this subsystem of the diagram alone"),
+        several("--outside", "PATH", "blocks of the diagram that are not written, such as the plant", default=[]),
+        several("--outputs", "NAME", "signals that are outputs"),
+        argument("--number", choices=("double", "float"), default="double", help="type of numbers"),
+        flag("--own-functions", "elementary functions of Loopwright in place of math.h's"),
+        flag("--measure", "compile it for Cortex-M4 and M0, and count the instructions of ticks"),
+        argument(
+            "--test",
+            metavar="FILE.csv",
+            help="test signal for --measure: a column for each input, such as force or force[1]; a row for each tick",
+        ),
+        as_json("the files and the report"),
+    ),
+    carry_out=_c,
+)

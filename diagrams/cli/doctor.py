@@ -8,34 +8,12 @@ from pathlib import Path
 
 from ...fmus.archive import ArchiveLimits
 from ...fmus.checks import doctor
-from .text import add_json, check_file, say, say_json
+from .arguments import as_json
+from .command import Command, argument
+from .text import check_file, say, say_json
 
 
-def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the parser of `main`."""
-    parser = commands.add_parser(
-        "doctor",
-        help="say whether an FMU runs here, and what would help",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Examine an FMU of any tool: content, libraries for this machine, violations of the standard, a\n"
-        "trial run of each interface in its own process, and a verdict in the first line.",
-        epilog="examples:\n  loopwright doctor plant.fmu\n  loopwright doctor plant.fmu --no-run --json\n\n"
-        "exit status: 0 done: it runs here, or should; 1 it does not; 2 wrong usage",
-    )
-    parser.add_argument("file", metavar="FILE.fmu")
-    parser.add_argument(
-        "--run",
-        action=argparse.BooleanOptionalAction,
-        help="try it, or don't: it is a program of its maker's, and may take a licence (default: try it, unless it "
-        "says that it needs another program)",
-    )
-    parser.add_argument(
-        "--max-size", type=float, metavar="GB", help="unpacked size up to which it is read (default: 8)"
-    )
-    add_json(parser, "all of it")
-
-
-def run_doctor(arguments: argparse.Namespace) -> int:
+def _doctor(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright doctor``."""
     path = Path(arguments.file).expanduser()
     usable = os.path.isfile(path)
@@ -52,3 +30,25 @@ def run_doctor(arguments: argparse.Namespace) -> int:
     if not usable:
         return 2
     return 0 if diagnosis.runs else 1
+
+
+DOCTOR = Command(
+    name="doctor",
+    help="say whether an FMU runs here, and what would help",
+    description="Examine an FMU of any tool: content, libraries for this machine, violations of the standard, a\n"
+    "trial run of each interface in its own process, and a verdict in the first line.",
+    examples=("doctor plant.fmu", "doctor plant.fmu --no-run --json"),
+    exit_status="0 done: it runs here, or should; 1 it does not; 2 wrong usage",
+    arguments=(
+        argument("file", metavar="FILE.fmu"),
+        argument(
+            "--run",
+            action=argparse.BooleanOptionalAction,
+            help="try it, or don't: it is a program of its maker's, and may take a licence (default: try it, unless it "
+            "says that it needs another program)",
+        ),
+        argument("--max-size", type=float, metavar="GB", help="unpacked size up to which it is read (default: 8)"),
+        as_json("all of it"),
+    ),
+    carry_out=_doctor,
+)

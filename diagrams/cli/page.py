@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from ...blocks.core import OptionError
 from ..paper import experiments
+from .arguments import as_json
+from .command import Argument, Command, argument, repeated
 from .subjects import open_user_diagram
-from .text import add_json, say, say_json
+from .text import say, say_json
 
 if TYPE_CHECKING:
     from ..web_page import WebPage
@@ -18,45 +20,7 @@ if TYPE_CHECKING:
 _HAND = "hand"
 
 
-def add_page(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``page`` to the parser of `main`."""
-    page = commands.add_parser(
-        "page",
-        help="write a diagram as a web page that runs",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="DIAGRAM is FILE.py:NAME: a diagram in a file of yours, or a function without arguments that\n"
-        "returns one; or hand: experiment C of the paper, guided by the pointer. One file, which opens from the disk:\n"
-        "it runs in the browser, with sliders and plots.",
-        epilog="examples:\n  loopwright page hand\n  loopwright page loop.py:loop --out loop.html\n"
-        "  loopwright page loop.py:loop --input target=-100:100 --slider pid.kp=0:5 --plot speed,target --plot u\n"
-        "\nexit status:\n  0    done\n  1    it can't be built: an FMU of others, a function of Python, no compiler\n"
-        "  2    wrong usage; nothing was written\n  130  interrupted (Ctrl-C)",
-    )
-    page.add_argument("diagram", metavar="DIAGRAM", help="FILE.py:NAME, or hand")
-    page.add_argument("--out", metavar="FILE.html", help="file (default: NAME.html)")
-    for option, what in (("input", "a source that is moved by hand"), ("slider", "a parameter")):
-        page.add_argument(
-            f"--{option}",
-            metavar="NAME[=LOW:HIGH]",
-            action="append",
-            default=[],
-            dest=f"{option}s",
-            help=f"{what}, with its range; repeat it for several",
-        )
-    page.add_argument(
-        "--plot",
-        metavar="NAME[,NAME]",
-        action="append",
-        default=[],
-        dest="plots",
-        help="signals of a plot; repeat it for several (default: the named wires)",
-    )
-    page.add_argument("--step", type=float, metavar="S", help="seconds between samples, where there is no clock")
-    page.add_argument("--speed", type=float, default=1.0, metavar="X", help="times real time at first (default: 1)")
-    add_json(page, "the file and its size")
-
-
-def page_command(arguments: argparse.Namespace) -> int:
+def _page(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright page``."""
     page, file = _make(arguments)
     if arguments.json:
@@ -88,10 +52,11 @@ def _ranges(given: list[str], option: str) -> dict[str, tuple[float, float] | No
         name, _, ends = text.partition("=")
         found[name] = None
         if ends:
-            low, high = (_number(end) for end in (ends.partition(":")[0], ends.partition(":")[2]))
-            if not low < high:
+            low, _, high = ends.partition(":")
+            span = _number(low), _number(high)
+            if not span[0] < span[1]:
                 raise OptionError(f"found {text!r}; expected a range, such as {name}=0:5.", port=option)
-            found[name] = (low, high)
+            found[name] = span
     return found
 
 
@@ -100,3 +65,45 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
+
+
+def _ranged(name: str, noun: str) -> Argument:
+    text = f"{noun}, with its range; repeat it for several"
+    return repeated(f"--{name}", "NAME[=LOW:HIGH]", text, dest=f"{name}s")
+
+
+PAGE = Command(
+    name="page",
+    help="write a diagram as a web page that runs",
+    description="DIAGRAM is FILE.py:NAME: a diagram in a file of yours, or a function without arguments that\n"
+    "returns one; or hand: experiment C of the paper, guided by the pointer. One file, which opens from the disk:\n"
+    "it runs in the browser, with sliders and plots.",
+    examples=(
+        "page hand",
+        "page loop.py:loop --out loop.html",
+        "page loop.py:loop --input target=-100:100 --slider pid.kp=0:5 --plot speed,target --plot u",
+    ),
+    exit_status={
+        0: "done",
+        1: "it can't be built: an FMU of others, a function of Python, no compiler",
+        2: "wrong usage; nothing was written",
+        130: "interrupted (Ctrl-C)",
+    },
+    arguments=(
+        argument("diagram", metavar="DIAGRAM", help="FILE.py:NAME, or hand"),
+        argument("--out", metavar="FILE.html", help="file (default: NAME.html)"),
+        _ranged("input", "a source that is moved by hand"),
+        _ranged("slider", "a parameter"),
+        repeated(
+            "--plot",
+            "NAME[,NAME]",
+            "signals of a plot; repeat it for several (default: the named wires)",
+            dest="plots",
+        ),
+        argument("--step", type=float, metavar="S", help="seconds between samples, where there is no clock"),
+        argument("--speed", type=float, default=1.0, metavar="X", help="times real time at first (default: 1)"),
+        as_json("the file and its size"),
+    ),
+    carry_out=_page,
+    writes_at_the_end=True,
+)

@@ -33,6 +33,8 @@ from ..requirements import (
     read_requirements,
 )
 from ..simulation import work_notes
+from .arguments import PLANT, experiment_option, parse_pairs
+from .command import Command, argument, flag, repeated
 from .subjects import open_subject
 from .text import say
 
@@ -56,87 +58,7 @@ DEFAULT = "B"
 """The experiment whose Fig. 3 is taken: both admittances are in it."""
 
 
-def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the parser of `main`."""
-    report = commands.add_parser(
-        "report",
-        help="analyse a diagram and write a design report",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Analyse a diagram for design: operating points, poles, margins of its loops, admittance and\n"
-        "coupled stability, each number confirmed by an independent computation; and write it as one HTML page.\n\n"
-        "DIAGRAM is an experiment of the paper (A, B, C or D; B without one: Fig. 3 with both admittances)\n"
-        "or FILE.py:NAME, a diagram of yours, or a function without arguments that returns one.",
-        epilog="examples:\n  loopwright report loop.py:loop --out loop.html --pdf\n"
-        "  loopwright report loop.py:loop --requirements loop.toml --check\n"
-        "  loopwright report loop.py:loop --requirements loop.toml --check --at trim\n"
-        "  loopwright report C --option delay=1\n\n"
-        "options of the experiments: as in loopwright run --help\n\n"
-        "exit status:\n  0    done; with --check: all requirements are met\n"
-        "  1    the analysis failed, or a plant could not be built; nothing is written\n"
-        "  2    wrong usage; nothing was analysed\n  3    with --check: a requirement fails; the files are written\n"
-        "  4    with --check: a requirement is not decided, and none fails; the files are written\n"
-        "  130  interrupted (Ctrl-C); nothing is written",
-    )
-    report.add_argument("diagram", nargs="?", metavar="DIAGRAM", help="A, B, C, D, or FILE.py:NAME")
-    report.add_argument(
-        "--at",
-        type=_parse_at,
-        metavar="trim|SECONDS",
-        help="the operating point: trim for the one at rest that diagram.trim() finds, or the time in s to which the "
-        "diagram is run (default: the start)",
-    )
-    report.add_argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or the diagram's name)")
-    report.add_argument("--pdf", action="store_true", help="the same as PDF next to it (pip install 'loopwright[pdf]')")
-    report.add_argument("--json", action="store_true", help="all numbers as JSON next to it")
-    report.add_argument(
-        "--requirements", metavar="FILE.toml", help="requirements on loops and responses; see docs/howto/reports.md"
-    )
-    report.add_argument(
-        "--measured",
-        metavar="WIRE=FILE.csv",
-        action="append",
-        default=[],
-        help="a loop that was measured at a wire: its margins are next to the model's, requirements hold for them, "
-        "too; repeat it for several",
-    )
-    report.add_argument(
-        "--worst-case",
-        metavar="FILE.toml",
-        help="find a worst case over ranges of parameters, as the file's table [worst_case] says, which the file of "
-        "the requirements may have, too; see docs/howto/worst_case.md",
-    )
-    report.add_argument(
-        "--contact",
-        metavar="FILE.toml",
-        help="contacts of environments with the plant, as the file's tables [contact.NAME] say, which the file of the "
-        "requirements may have, too; see docs/howto/contact.md",
-    )
-    report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
-    for name in ABOUT:
-        report.add_argument(f"--{name}", metavar="TEXT", help=f"the {name} in the report's heading")
-    report.add_argument("--summary", action="store_true", help="write the summary alone: two pages")
-    report.add_argument("--no-appendix", action="store_true", help="leave out the appendix: all numbers, definitions")
-    report.add_argument("--db", action="store_true", help="draw magnitudes in dB")
-    report.add_argument("--hz", action="store_true", help="draw frequency responses over Hz in place of rad/s")
-    report.add_argument("--paper", choices=["A4", "letter"], default="A4", help="paper of the PDF (default: A4)")
-    report.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
-    report.add_argument(
-        "--stairs",
-        choices=["gain", "zero"],
-        help="take all stairs as their mean slope, or by their slope of zero (default: those of quantizers and "
-        "encoders as their mean slope)",
-    )
-    report.add_argument(
-        "--option",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        dest="options",
-        help="an option of the experiment, such as delay=1; repeat it for several",
-    )
-
-
-def report_command(arguments: argparse.Namespace) -> int:
+def _report(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
     from ..report import check_files, write_report
 
@@ -240,13 +162,7 @@ def _read_measured(given: Sequence[str]) -> dict[str, Any]:
     from ..frequency import measured_margins, read_frequency_data
 
     found: dict[str, Any] = {}
-    for text in given:
-        wire, equals, file = text.partition("=")
-        wire = wire.strip()
-        if not equals or not wire or not file:
-            raise OptionError(f"found {text!r}; expected WIRE=FILE.csv, such as u=u.csv.", port="--measured")
-        if wire in found:
-            raise OptionError(f"the wire {wire!r} is given twice; give it once.", port="--measured")
+    for wire, file in parse_pairs(given, "--measured", "WIRE=FILE.csv", "u=u.csv").items():
         found[wire] = read_frequency_data(Path(file).expanduser())
         try:
             measured_margins(found[wire])
@@ -319,3 +235,78 @@ def _analyse(
         _written=True,
     )
     return with_drawing(made, diagram.wired)
+
+
+REPORT = Command(
+    name="report",
+    help="analyse a diagram and write a design report",
+    description="Analyse a diagram for design: operating points, poles, margins of its loops, admittance and\n"
+    "coupled stability, each number confirmed by an independent computation; and write it as one HTML page.\n\n"
+    "DIAGRAM is an experiment of the paper (A, B, C or D; B without one: Fig. 3 with both admittances)\n"
+    "or FILE.py:NAME, a diagram of yours, or a function without arguments that returns one.",
+    examples=(
+        "report loop.py:loop --out loop.html --pdf",
+        "report loop.py:loop --requirements loop.toml --check",
+        "report loop.py:loop --requirements loop.toml --check --at trim",
+        "report C --option delay=1",
+    ),
+    notes="options of the experiments: as in loopwright run --help",
+    exit_status={
+        0: "done; with --check: all requirements are met",
+        1: "the analysis failed, or a plant could not be built; nothing is written",
+        2: "wrong usage; nothing was analysed",
+        3: "with --check: a requirement fails; the files are written",
+        4: "with --check: a requirement is not decided, and none fails; the files are written",
+        130: "interrupted (Ctrl-C); nothing is written",
+    },
+    arguments=(
+        argument("diagram", nargs="?", metavar="DIAGRAM", help="A, B, C, D, or FILE.py:NAME"),
+        argument(
+            "--at",
+            type=_parse_at,
+            metavar="trim|SECONDS",
+            help="the operating point: trim for the one at rest that diagram.trim() finds, or the time in s to which "
+            "the diagram is run (default: the start)",
+        ),
+        argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or the diagram's name)"),
+        flag("--pdf", "the same as PDF next to it (pip install 'loopwright[pdf]')"),
+        flag("--json", "all numbers as JSON next to it"),
+        argument(
+            "--requirements", metavar="FILE.toml", help="requirements on loops and responses; see docs/howto/reports.md"
+        ),
+        repeated(
+            "--measured",
+            "WIRE=FILE.csv",
+            "a loop that was measured at a wire: its margins are next to the model's, requirements hold for them, "
+            "too; repeat it for several",
+        ),
+        argument(
+            "--worst-case",
+            metavar="FILE.toml",
+            help="find a worst case over ranges of parameters, as the file's table [worst_case] says, which the file "
+            "of the requirements may have, too; see docs/howto/worst_case.md",
+        ),
+        argument(
+            "--contact",
+            metavar="FILE.toml",
+            help="contacts of environments with the plant, as the file's tables [contact.NAME] say, which the file of "
+            "the requirements may have, too; see docs/howto/contact.md",
+        ),
+        flag("--check", "say by the exit status whether they are met"),
+        *(argument(f"--{name}", metavar="TEXT", help=f"the {name} in the report's heading") for name in ABOUT),
+        flag("--summary", "write the summary alone: two pages"),
+        flag("--no-appendix", "leave out the appendix: all numbers, definitions"),
+        flag("--db", "draw magnitudes in dB"),
+        flag("--hz", "draw frequency responses over Hz in place of rad/s"),
+        argument("--paper", choices=["A4", "letter"], default="A4", help="paper of the PDF (default: A4)"),
+        PLANT,
+        argument(
+            "--stairs",
+            choices=["gain", "zero"],
+            help="take all stairs as their mean slope, or by their slope of zero (default: those of quantizers and "
+            "encoders as their mean slope)",
+        ),
+        experiment_option("an option of the experiment, such as delay=1"),
+    ),
+    carry_out=_report,
+)

@@ -8,37 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from ..ssp import SspDescription, read_ssp
-from .diagrams import add_set, change_diagram, parse_positive
+from .arguments import DIAGRAM, as_json, change_diagram, parse_positive, set_parameters
+from .command import Command, argument, flag
 from .subjects import open_user_diagram, split_ssp
-from .text import add_json, say, say_json
+from .text import say, say_json
 
 
-def add_ssp(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the parser of `main`."""
-    made = commands.add_parser(
-        "ssp",
-        help="write a diagram of FMUs as an SSP",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="DIAGRAM is FILE.py:NAME: a diagram in a file of yours. It is written as an SSP (System Structure\n"
-        "and Parameterization): FMUs, connections, parameter sets, and a layout.\n\n"
-        "The other way, an SSP of any tool is a diagram for 'run', 'draw' and 'sweep', FILE.ssp or\n"
-        "FILE.ssp:VARIANT.ssd, and 'inspect' says what is in it.",
-        epilog="examples:\n  loopwright ssp loop.py:loop --out loop.ssp --stop 10\n  loopwright inspect loop.ssp\n"
-        "  loopwright run loop.ssp --duration 2 --step 0.01\n"
-        "\nexit status: 0 done, 1 it has no place in an SSP, 2 wrong usage",
-    )
-    made.add_argument("diagram", metavar="DIAGRAM", help="FILE.py:NAME")
-    made.add_argument("--out", metavar="FILE.ssp", help="file (default: NAME.ssp)")
-    made.add_argument("--stop", type=parse_positive, metavar="S", help="proposed end of a simulation, in s")
-    made.add_argument("--step", type=parse_positive, metavar="S", help="proposed communication step, in s")
-    made.add_argument(
-        "--flat", action="store_true", help="one level without inputs and outputs, for readers that know no more"
-    )
-    add_set(made)
-    add_json(made, "the file and its content")
-
-
-def ssp_command(arguments: argparse.Namespace) -> int:
+def _ssp(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright ssp``."""
     with open_user_diagram(arguments.diagram) as (diagram, _):
         changed = change_diagram(diagram, arguments)
@@ -67,3 +43,30 @@ def inspect_ssp(name: str, *, as_json: bool) -> int:
 def _facts(about: SspDescription) -> dict[str, Any]:
     found = {f.name: getattr(about, f.name) for f in dataclasses.fields(about) if not f.name.startswith("_")}
     return {**found, "file": str(about.file)}
+
+
+SSP = Command(
+    name="ssp",
+    help="write a diagram of FMUs as an SSP",
+    description="DIAGRAM is FILE.py:NAME: a diagram in a file of yours. It is written as an SSP (System Structure\n"
+    "and Parameterization): FMUs, connections, parameter sets, and a layout.\n\n"
+    "The other way, an SSP of any tool is a diagram for 'run', 'draw' and 'sweep', FILE.ssp or\n"
+    "FILE.ssp:VARIANT.ssd, and 'inspect' says what is in it.",
+    examples=(
+        "ssp loop.py:loop --out loop.ssp --stop 10",
+        "inspect loop.ssp",
+        "run loop.ssp --duration 2 --step 0.01",
+    ),
+    exit_status="0 done, 1 it has no place in an SSP, 2 wrong usage",
+    arguments=(
+        DIAGRAM,
+        argument("--out", metavar="FILE.ssp", help="file (default: NAME.ssp)"),
+        argument("--stop", type=parse_positive, metavar="S", help="proposed end of a simulation, in s"),
+        argument("--step", type=parse_positive, metavar="S", help="proposed communication step, in s"),
+        flag("--flat", "one level without inputs and outputs, for readers that know no more"),
+        set_parameters(),
+        as_json("the file and its content"),
+    ),
+    carry_out=_ssp,
+    writes_at_the_end=True,
+)

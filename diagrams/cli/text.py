@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 import json
+import math
 import re
 import sys
 from pathlib import Path
 from typing import IO, Any
+
+import numpy as np
 
 from ...blocks.core import OptionError, explain_disk_errors
 
@@ -38,14 +40,21 @@ def say(text: str, stream: IO[str] | None = None) -> None:
     print(fit(text, stream), file=stream, flush=True)
 
 
-def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup, content: str) -> None:
-    """Add ``--json``, which prints a content as JSON in place of the text."""
-    parser.add_argument("--json", action="store_true", help=f"print {content} as JSON")
-
-
 def say_json(content: Any) -> None:
     """Print a content as JSON, in ASCII, which any terminal can show."""
     print(json.dumps(content, indent=2, default=str))
+
+
+def finite_or_none(value: Any) -> Any:
+    """Return a number, or an array as lists, with None where it is not finite: JSON has no other word."""
+    if np.ndim(value):
+        return [finite_or_none(one) for one in value]
+    return float(value) if math.isfinite(value) else None
+
+
+def size_text(n: int) -> str:
+    """Return a number of bytes as text."""
+    return f"{n / 1e6:.2f} MB" if n >= 1e6 else f"{n / 1e3:.1f} kB"
 
 
 def fit(text: str, stream: IO[str]) -> str:

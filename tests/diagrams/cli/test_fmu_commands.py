@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from lxml import etree
 
-from loopwright.diagrams.cli import fmu as _cli_fmu
+from loopwright.diagrams.cli import build as _build
 from loopwright.diagrams.cli.command_line import main
 from loopwright.fmus.archive import read_library
 from loopwright.fmus.checks import summary as _summary
@@ -246,7 +246,7 @@ def test_platforms(here, capsys, monkeypatch):
         asked.append(options["platform"])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_cli_fmu, "build_model", build)
+    monkeypatch.setattr(_build, "build_model", build)
     for given in (["x86_64-windows", "x86_64-linux"], ["aarch64-darwin", "all"]):
         assert main(["build", "mine.py:Lag", "--platform", *given]) == 130
     assert asked == [["x86_64-windows", "x86_64-linux"], "all"]

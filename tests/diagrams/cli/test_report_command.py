@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.diagrams import ConfirmationError
-from loopwright.diagrams.cli.command_line import _make_parser, main
+from loopwright.diagrams.cli.command_line import main, make_parser
 from loopwright.diagrams.frequency.number import Number
 from loopwright.diagrams.report.pages.document import Section
 from loopwright.diagrams.report.pages.report import Report
@@ -235,4 +235,4 @@ def test_the_commands_of_the_page_on_reports_are_understood():
     commands = [shlex.split(line, comments=True)[1:] for line in lines]
     assert len(commands) == 6
     for command in commands:
-        assert _make_parser().parse_args(command).command == "report"
+        assert make_parser().parse_args(command).command == "report"

@@ -15,9 +15,9 @@ import pytest
 
 from loopwright.blocks import OptionError, PathDomainError
 from loopwright.diagrams import Interrupted, experiments
-from loopwright.diagrams.cli import command_line as _cli
-from loopwright.diagrams.cli import options as _cli_options
-from loopwright.diagrams.cli.command_line import main
+from loopwright.diagrams.cli import run_experiments as _experiments
+from loopwright.diagrams.cli.arguments import parse_value
+from loopwright.diagrams.cli.command_line import main, make_parser
 from loopwright.diagrams.paper.experiment_figures import plot_experiment, plot_path
 from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers
 from loopwright.diagrams.plotting import save
@@ -57,7 +57,7 @@ def test_samples_are_written_exactly(done):
     with (folder / "A.csv").open() as file:
         assert file.readline() == HEADER + "\n"
     table = np.loadtxt(folder / "A.csv", delimiter=",", skiprows=1)
-    signals = [run.t[:, None], *(run[name].reshape(len(run.t), -1) for name in _cli.SIGNALS)]
+    signals = [run.t[:, None], *(run[name].reshape(len(run.t), -1) for name in _experiments.SIGNALS)]
     assert table.shape == (11001, 23)
     assert np.array_equal(table, np.hstack(signals))  # 17 digits: bit for bit
 
@@ -164,7 +164,7 @@ def test_what_never_settles_is_null(tmp_path, capsys, undrawn):
     ],
 )
 def test_option_values(text, value):
-    assert _cli_options.parse_value(text) == value
+    assert parse_value(text) == value
 
 
 # --- a run that fails -----------------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ def test_figures_of_next_to_nothing(done, tmp_path, ticks):
         ("r", short.plot("xi")),
     ):
         assert all(file.stat().st_size > 1000 for file in save(figure, tmp_path / name))
-    short.to_csv(tmp_path / "A.csv", *_cli.SIGNALS)
+    short.to_csv(tmp_path / "A.csv", *_experiments.SIGNALS)
     lines = (tmp_path / "A.csv").read_text().splitlines()
     assert lines[0] == HEADER
     assert len(lines) == 1 + ticks
@@ -245,7 +245,7 @@ def test_interrupted(tmp_path, capsys, monkeypatch, undrawn):
     ("arguments", "text"),
     [
         (["run", "E"], "loopwright: error: there is no experiment 'E'. Known: A, B, C, D."),
-        (["run", "A", "--option", "delay"], "found --option 'delay'; expected NAME=VALUE, such as --option delay=1."),
+        (["run", "A", "--option", "delay"], "--option: found 'delay'; expected NAME=VALUE, such as --option delay=1."),
         (
             ["run", "A", "--option", "delya=1"],
             "--option delya: no experiment has such an option. Did you mean 'delay'?",
@@ -269,6 +269,8 @@ def test_interrupted(tmp_path, capsys, monkeypatch, undrawn):
             ["run", "A", "--plant", "x.fmu", "--option", "plant='y.fmu'"],
             "--plant: the plant is given twice; give it once.",
         ),
+        (["run", "A", "--solver", "RK45"], "--solver: it is for diagrams, FILE.py:NAME; experiments have --option."),
+        (["run", "A", "--json"], "--json: it is for diagrams, FILE.py:NAME; experiments have --option."),
         (["run", "--out"], "expected one argument"),
         (["ran"], "there is no command 'ran'. Did you mean 'run'"),
         (["simulate", "loop.py:loop"], "there is no command 'simulate'. Did you mean 'run'?"),
@@ -323,7 +325,7 @@ def test_a_plant_with_scalar_ports(tmp_path, capsys, undrawn):
     assert json.loads((tmp_path / "out" / "A.json").read_text())["overshoot_par"] == pytest.approx(0.248935, abs=2e-3)
     capsys.readouterr()
     for words, text in (
-        (["run", "A", *plant, "--rename", "s_Y"], "found --rename 's_Y'; expected NAME=PORT"),
+        (["run", "A", *plant, "--rename", "s_Y"], "--rename: found 's_Y'; expected NAME=PORT"),
         (["run", "A", *plant, *renames[:2], *renames[:2]], "--rename F_my: it is given twice; give it once."),
         (["run", "A", *renames], "--rename: it names ports of another plant; give that plant, too."),
         (["run", "A", *plant, *renames[:-4], *renames[-2:]], "no variable that is renamed to acceleration[1]"),
@@ -364,7 +366,7 @@ def test_the_help_of_each_command_has_examples_that_it_takes(command, capsys):
     examples = re.findall(r"^  loopwright (.+)$", text.partition("examples:\n")[2].partition("\n\n")[0], re.MULTILINE)
     assert len(examples) >= 2
     for example in examples:
-        assert vars(_cli._make_parser().parse_args(shlex.split(example)))["command"] == command
+        assert vars(make_parser().parse_args(shlex.split(example)))["command"] == command
 
 
 def test_version_and_help(capsys):
@@ -402,7 +404,7 @@ def test_an_interrupt_while_plants_are_built_ends_without_a_traceback(tmp_path, 
     def interrupt(**options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_cli.gantry, "build", interrupt)
+    monkeypatch.setattr(_experiments.gantry, "build", interrupt)
     assert main(["run", "A", "--out", str(tmp_path)]) == 130
     assert capsys.readouterr().err == "loopwright: interrupted.\n"
 

@@ -12,7 +12,8 @@ import pytest
 
 from loopwright.blocks import OptionError
 from loopwright.diagrams import experiments
-from loopwright.diagrams.cli import options as _cli_options
+from loopwright.diagrams.cli import experiment_options as _cli_options
+from loopwright.diagrams.cli.arguments import parse_value
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.paper.experiment_options import LIMITS
 from loopwright.diagrams.paper.experiments import EXPERIMENTS, compliance, force_tracking, path_following
@@ -44,7 +45,7 @@ def test_numpys_truth_values_are_some():
     ("word", "meant"), [("yes", True), ("On", True), ("TRUE", True), ("no", False), ("off", False)]
 )
 def test_words_for_truth_on_the_command_line(word, meant):
-    assert _cli_options.parse_value(word) is meant
+    assert parse_value(word) is meant
 
 
 def test_a_word_that_is_no_truth_value(tmp_path, capsys):

@@ -204,7 +204,7 @@ def test_the_command_line_takes_measured_loops(tmp_path, monkeypatch, capsys, ga
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ("e.csv", r"--measured: found 'e.csv'; expected WIRE=FILE.csv, such as u=u.csv"),
+        ("e.csv", r"--measured: found 'e.csv'; expected WIRE=FILE.csv, such as --measured u=u.csv"),
         ("e=none.csv", r"none.csv: it can't be read: there is no 'none.csv'; .* Name another file"),
         ("e=bad.csv", r"bad.csv: line 4 has no number in the column 'imag'"),
         ("f=e.csv", r"there is no signal 'f' in this diagram"),

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import ast
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from inspect import signature
-from types import MappingProxyType
 from typing import Any
 
 from ...blocks.core import OptionError, near
 from ..paper import DEFAULTS, EXPERIMENTS
+from .arguments import parse_pairs, parse_value
 from .text import say
-
-_WORDS: Mapping[str, bool | None] = MappingProxyType(
-    {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False, "none": None, "null": None}
-)
 
 
 def known_options(letter: str) -> dict[str, Any]:
@@ -47,11 +42,8 @@ def parse_letters(given: Sequence[str]) -> list[str]:
 def parse_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the options that were given, by name."""
     options: dict[str, Any] = {}
-    for text in arguments.options:
-        name, equals, value = text.partition("=")
-        name = name.strip().replace("-", "_")
-        if not equals or not name:
-            raise OptionError(f"found --option {text!r}; expected NAME=VALUE, such as --option delay=1.")
+    for given, value in parse_pairs(arguments.options, "--option", "NAME=VALUE", "delay=1").items():
+        name = given.replace("-", "_")
         if name == "path":
             raise OptionError(
                 "a path can't be given on the command line; take Python: "
@@ -60,7 +52,7 @@ def parse_options(arguments: argparse.Namespace) -> dict[str, Any]:
             )
         if name in options:
             raise OptionError("it is given twice; give it once.", port=f"--option {name}")
-        options[name] = parse_value(value.strip())
+        options[name] = parse_value(value)
     if arguments.plant is not None:
         if "plant" in options:
             raise OptionError("the plant is given twice; give it once.", port="--plant")
@@ -70,27 +62,11 @@ def parse_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def parse_renames(arguments: argparse.Namespace) -> dict[str, str]:
     """Return the ports' names that were given to the plant, by the FMU's names."""
-    found: dict[str, str] = {}
-    for text in arguments.renames:
-        name, equals, port = text.rpartition("=")  # names of variables may contain "="; ports of Fig. 3 don't
-        if not equals or not name.strip() or not port.strip():
-            raise OptionError(f"found --rename {text!r}; expected NAME=PORT, such as --rename 's_y=position[1]'.")
-        if name.strip() in found:
-            raise OptionError("it is given twice; give it once.", port=f"--rename {name.strip()}")
-        found[name.strip()] = port.strip()
+    # Names of variables may contain "="; ports of Fig. 3 don't.
+    found = parse_pairs(arguments.renames, "--rename", "NAME=PORT", "'s_y=position[1]'", last=True)
     if found and arguments.plant is None:
         raise OptionError("it names ports of another plant; give that plant, too.", port="--rename")
     return found
-
-
-def parse_value(text: str) -> Any:
-    """Read a word of `_WORDS`, or a Python or JSON literal; anything else is text."""
-    if text.lower() in _WORDS:
-        return _WORDS[text.lower()]
-    try:
-        return ast.literal_eval(text)
-    except (ValueError, SyntaxError, MemoryError, RecursionError):
-        return text
 
 
 def share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
