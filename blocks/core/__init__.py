@@ -3,7 +3,7 @@
 from . import arguments as kinds
 from . import arithmetic, source
 from .arguments import Kind, accepts, check_argument, shorten
-from .arithmetic import Demux, Gain, Mux, Product, Stack, Sum, check_shapes, describe_shape, shape_of
+from .arithmetic import Demux, Gain, Mux, Product, Stack, Sum, check_shapes, clip, describe_shape, shape_of
 from .block import SOLVED, Block
 from .brief import brief, count_of, enumerate_some
 from .collection import without_collection
@@ -159,6 +159,7 @@ __all__ = [
     "check_file",
     "check_name",
     "check_shapes",
+    "clip",
     "close_names",
     "convert_unit",
     "count_of",

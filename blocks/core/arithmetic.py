@@ -41,6 +41,12 @@ def check_shapes(**values: Array) -> None:
             )
 
 
+def clip(value: Array, lower: Array | None, upper: Array | None) -> Array:
+    """Return a value within limits, None for none, in an equation; NaN passes through (a traced np.clip loses it)."""
+    value = value if upper is None else np.where(value > upper, upper, value)
+    return value if lower is None else np.where(value < lower, lower, value)
+
+
 class Sum(Block):
     """Sum with signs: y = ± u₁ ± u₂ ….
 

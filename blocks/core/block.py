@@ -20,7 +20,7 @@ from .errors import (
     close_names,
     near,
 )
-from .ports import Event, Input, Output, Port, PortUnit, State, check_port_names
+from .ports import DeclaredPorts, Event, Input, Output, Port, PortUnit, State, check_port_names
 from .shown import ShownMembers, documented
 from .signals import (
     Call,
@@ -182,7 +182,8 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
         for attribute in ("inputs", "outputs", "states", "events"):
             chosen = {k: p for k, p in ports.items() if _is_kind(p, attribute)}
             if not isinstance(getattr(cls, attribute), property):  # ports that follow from the parameters
-                setattr(cls, attribute, chosen)
+                plain = all(port.only_if is None for port in chosen.values())
+                setattr(cls, attribute, chosen if plain else DeclaredPorts(chosen))
             cls.__doc__ = with_section(cls.__doc__ or "", attribute.capitalize(), port_section(chosen))
         for source, held in cls.quanta.items():
             for name, known in ((source, ports), (held, cls.parameter_specs)):
@@ -193,6 +194,16 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
                         block=cls.__name__,
                     )
         for name, port in ports.items():
+            if isinstance(port.only_if, str) and not (
+                port.only_if in cls.parameter_specs or hasattr(cls, port.only_if)
+            ):
+                conditions = [n for n in (*cls.parameter_specs, *vars(cls)) if not n.startswith("_")]
+                raise DefinitionError(
+                    f"found only_if={port.only_if!r}; expected a parameter or property of this block. "
+                    f"{near(port.only_if, conditions)}",
+                    block=cls.__name__,
+                    port=name,
+                )
             tracked = getattr(port, "tracks", None)
             if tracked is not None and not (tracked in ports and _is_kind(ports[tracked], "outputs")):
                 raise DefinitionError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from .errors import DefinitionError, near
 from .explained_calls import explain_calls
-from .signals import Signal, Wireable
+from .signals import Signal, UnknownAttributeError, Wireable
 from .units import parse_unit
 
 Shape = tuple[int, ...]
@@ -33,6 +33,9 @@ class Port:
         Typical size, positive, in its unit; a solver's tolerances are relative to it.
     minimum, maximum : float, optional
         Range in its unit; an FMU refuses values outside.
+    only_if : str or callable, optional
+        Condition without which a block doesn't have the port: the name of a parameter or property that is true, or a
+        function of the block. Without it every block of the class has the port.
     """
 
     def __init__(
@@ -45,14 +48,29 @@ class Port:
         nominal: float | None = None,
         minimum: float | None = None,
         maximum: float | None = None,
+        only_if: str | Callable[[Any], object] | None = None,
     ):
         self.shape, self.unit, self.description, self.name = _shape_of(shape), _unit_of(unit), description, name
-        self.nominal, self.minimum, self.maximum = nominal, minimum, maximum
+        self.nominal, self.minimum, self.maximum, self.only_if = nominal, minimum, maximum, only_if
         if nominal is not None and not nominal > 0:
             raise DefinitionError(f"found nominal {nominal!r}; expected a positive number.")
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name  # checked by check_port_names: Python would wrap an error raised here in a RuntimeError
+
+    def is_of(self, block: Any) -> bool:
+        """Whether a block of the class has the port, with its parameters; see ``only_if``."""
+        if self.only_if is None:
+            return True
+        return bool(getattr(block, self.only_if) if isinstance(self.only_if, str) else self.only_if(block))
+
+    def _absence(self, block: Any) -> AttributeError:
+        """Return the error of an output that a block doesn't have."""
+        needs = f"{self.only_if} true" if isinstance(self.only_if, str) else "other parameters"
+        return UnknownAttributeError(
+            f"with these parameters it has no output {self.name!r}; expected {needs}. Give other parameters.",
+            block=block.label,
+        )
 
     def __repr__(self) -> str:
         unit = "" if self.unit is None else f", unit={self.unit!r}"
@@ -86,15 +104,15 @@ def _unit_of(given: Any) -> PortUnit:
     return given if isinstance(given, str) else tuple(units)
 
 
-def _known(kind: str, limits: Mapping[str, Any], *more: str) -> dict[str, Any]:
-    """Return further arguments of a port, ``nominal``, ``minimum`` and ``maximum``; refuse others."""
-    for name in limits:
-        if name not in LIMITS:
-            raise DefinitionError(f"{kind} has no argument {name!r}. {near(name, (*more, *LIMITS))}")
-    return dict(limits)
+def _known(kind: str, further: Mapping[str, Any], *more: str) -> dict[str, Any]:
+    """Return further arguments of a port, those of every `Port`; refuse others."""
+    for name in further:
+        if name not in _OF_EVERY_PORT:
+            raise DefinitionError(f"{kind} has no argument {name!r}. {near(name, (*more, *_OF_EVERY_PORT))}")
+    return dict(further)
 
 
-LIMITS = ("nominal", "minimum", "maximum")
+_OF_EVERY_PORT = ("nominal", "minimum", "maximum", "only_if")
 _TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", "parameters", "stepped"})
 _TAKEN |= {"drawn_as", "drawn_inside"}
 
@@ -113,9 +131,21 @@ def check_port_names(cls: type) -> None:
         raise DefinitionError(f"a port can't be called {name!r}: {why}. Take {step}.", block=cls.__name__, port=name)
 
 
+class DeclaredPorts:
+    """The ports of one kind that a class declares: all of them, read on the class; on a block those that it has."""
+
+    def __init__(self, declared: Mapping[str, Any]):
+        self.declared = declared
+
+    def __get__(self, block: Any, owner: type | None = None) -> Mapping[str, Any]:
+        if block is None:
+            return self.declared
+        return {name: port for name, port in self.declared.items() if port.is_of(block)}
+
+
 @explain_calls
 class Input(Port):
-    """An input. With ``default`` it may stay unwired. It takes ``nominal``, ``minimum`` and ``maximum`` of `Port`.
+    """An input. With ``default`` it may stay unwired. Its further arguments are those of `Port`.
 
     Parameters
     ----------
@@ -141,12 +171,12 @@ class Input(Port):
         models_plant: bool = False,
         at_start_only: bool = False,
         name: str = "",
-        **limits: Any,
+        **further: Any,
     ):
-        limits = _known(
-            "Input", limits, "shape", "unit", "description", "default", "tracks", "models_plant", "at_start_only"
+        further = _known(
+            "Input", further, "shape", "unit", "description", "default", "tracks", "models_plant", "at_start_only"
         )
-        super().__init__(shape, unit, description, name, **limits)
+        super().__init__(shape, unit, description, name, **further)
         self.tracks, self.models_plant, self.at_start_only = tracks, models_plant, at_start_only
         self.default = None if default is None else np.asarray(default, dtype=float)
 
@@ -192,10 +222,10 @@ class Output(Port):
         like: str | None = None,
         secondary: bool = False,
         name: str = "",
-        **limits: Any,
+        **further: Any,
     ):
-        limits = _known("Output", limits, "shape", "unit", "description", "like", "secondary")
-        super().__init__(None if like and shape == () else shape, unit, description, name, **limits)
+        further = _known("Output", further, "shape", "unit", "description", "like", "secondary")
+        super().__init__(None if like and shape == () else shape, unit, description, name, **further)
         self.like, self.secondary = like, secondary
 
     @overload
@@ -205,6 +235,8 @@ class Output(Port):
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None:
             return self
+        if not self.is_of(instance):
+            raise self._absence(instance)
         return Signal(instance, self.name)
 
 
@@ -238,10 +270,10 @@ class State(Port):
         output: bool = False,
         discrete: bool = False,
         name: str = "",
-        **limits: Any,
+        **further: Any,
     ):
-        limits = _known("State", limits, "unit", "description", "shape", "start", "like", "output", "discrete")
-        super().__init__(None, unit, description, name, **limits)
+        further = _known("State", further, "unit", "description", "shape", "start", "like", "output", "discrete")
+        super().__init__(None, unit, description, name, **further)
         if shape is not None and like is not None:
             raise DefinitionError(
                 f"found shape={shape!r} and like={like!r}; expected one of them. Leave out the one that doesn't hold."
@@ -265,8 +297,10 @@ class State(Port):
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None:
             return self
-        if self.output:
+        if self.output and self.is_of(instance):
             return Signal(instance, self.name)
+        if self.output:
+            raise self._absence(instance)
         raise AttributeError(f"{self.name!r} is a state of {instance!r}: it lives in the run, not on the block.")
 
 
@@ -290,6 +324,8 @@ class Event(Port):
     hysteresis : float
         Distance beyond zero, in the indicator's unit, at which the event fires; it ends chattering. It is used in
         diagrams; an exported FMU has its own.
+    only_if : str or callable, optional
+        Condition without which a block doesn't have the event, as of a `Port`.
     """
 
     def __init__(
@@ -300,8 +336,9 @@ class Event(Port):
         nominal: float = 1.0,
         hysteresis: float = 0.0,
         name: str = "",
+        only_if: str | Callable[[Any], object] | None = None,
     ):
-        super().__init__((), None, description, name, nominal=float(nominal))
+        super().__init__((), None, description, name, nominal=float(nominal), only_if=only_if)
         self.hysteresis = float(hysteresis)
         if not self.hysteresis >= 0.0:
             raise DefinitionError(f"found hysteresis {hysteresis!r}; expected a number of zero or more.")

@@ -16,6 +16,7 @@ from ..core import (
     PortUnit,
     Units,
     check_shapes,
+    clip,
     parameter,
     raise_unit,
     shorten,
@@ -117,13 +118,11 @@ class Limited(Block):
                     port="lower",
                 )
 
-    def clip(self, u: Array) -> Array:
-        """Return u within the limits; NaN passes through."""
+    def limited(self, u: Array) -> Array:
+        """Return u within the limits."""
         given = {k: v for k in ("limit", "lower", "upper") if (v := getattr(self, k)) is not None}
         check_shapes(**given, u=u)
-        low, high = (self.lower, self.upper) if self.limit is None else (-self.limit, self.limit)
-        result = u if low is None else np.where(u < low, low, u)
-        return result if high is None else np.where(u > high, high, result)
+        return clip(u, self.lower, self.upper) if self.limit is None else clip(u, -self.limit, self.limit)
 
 
 class Saturation(Limited):
@@ -145,7 +144,7 @@ class Saturation(Limited):
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the limited signal and the part cut off."""
-        y = self.clip(u.u)
+        y = self.limited(u.u)
         return y, u.u - y
 
 
@@ -166,4 +165,4 @@ class DeadZone(Limited):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the part beyond the limits."""
-        return u.u - self.clip(u.u)
+        return u.u - self.limited(u.u)

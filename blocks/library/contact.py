@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -101,9 +100,9 @@ class Wall(Block):
     force = Output(shape=None, unit="N", description="force F on the body")
     depth = Output(unit="m", secondary=True, description="depth δ in the wall; a gap is negative")
     contact = Output(secondary=True, description="1 while the wall pushes, else 0")
-    touching = State(discrete=True, description="1 while the wall pushes")
+    touching = State(discrete=True, description="1 while the wall pushes; with damping", only_if="damping")
     touch = Event("both", "the body reaches the wall", nominal=1e-3)
-    press = Event("both", "the wall stops pushing, or pushes again")
+    press = Event("both", "the wall stops pushing, or pushes again; with damping", only_if="damping")
 
     def check(self) -> None:
         """Refuse a normal of length zero, or of another shape than the point's."""
@@ -113,16 +112,6 @@ class Wall(Block):
                 "wall with as many entries as the point has. Give the normal, such as (0, −1).",
                 port="normal",
             )
-
-    @property
-    def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """``touching``, if the wall is damped; else none."""
-        return {"touching": type(self).touching} if self.damping else {}
-
-    @property
-    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """``touch``, and if the wall is damped ``press``."""
-        return {"touch": Wall.touch} | ({"press": Wall.press} if self.damping else {})
 
     def _measure(self, u: Any) -> tuple[Array, Array, Array]:
         """Return n, the depth δ, and k δ + d δ̇."""

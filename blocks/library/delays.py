@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from fractions import Fraction
 from functools import lru_cache
 from itertools import pairwise
@@ -11,38 +10,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, SampleTimeError, Shape, ShapeError, State, exact_number, parameter
-from .initial_values import StartsAtInput
+from ..core import Array, Block, Input, Output, SampleTimeError, State, exact_number, parameter
+from .past_inputs import PastInputs
 
 
-class History(State):
-    """State of the last inputs, the oldest first, one in a row; ``rows`` names the attribute of their number."""
-
-    def __init__(self, rows: str, start: str, description: str):
-        super().__init__(None, description, start=start, like="u")
-        self.rows = rows
-
-    def start_value(self, block: Any, shapes: Mapping[str, Shape]) -> np.ndarray:
-        """Return the start value, equal in all rows."""
-        shape = shapes.get(self.like or "")
-        if shape is None:  # the input's shape is not known yet: one row, which may show it
-            return super().start_value(block, shapes)
-        if len(shape) > 1:
-            raise ShapeError(
-                f"found shape {shape}; expected a scalar or a vector. Give each row its own block.",
-                block=block.label,
-                port=self.like,
-            )
-        row = super().start_value(block, shapes)
-        return np.array(np.broadcast_to(row, (getattr(block, self.rows), *row.shape)))
-
-
-def push(line: Array, value: Array) -> Array:
-    """Return the history with one more input and without the oldest."""
-    return np.concatenate([line[1:], np.stack([value])])
-
-
-class Delay(StartsAtInput, Block):
+class Delay(PastInputs):
     """Delay by whole samples: y[k] = u[k − n].
 
     The first n outputs are ``initial_value``; without it, the input just before t = 0: of a source that jumps there,
@@ -61,19 +33,18 @@ class Delay(StartsAtInput, Block):
     initial_value: Array | None = parameter(default=None, description="first outputs; None: u just before t = 0")
     u = Input(shape=None, description="signal to delay, a scalar or a vector")
     y = Output(like="u", description="the input n ticks ago")
-    line = History("steps", "initial_value", description="the last n inputs, the oldest first, one row for each")
-    _rows = "steps"
+
+    @property
+    def kept(self) -> int:
+        """Number of past inputs that are remembered, n."""
+        return self.steps
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the oldest input."""
         return x.line[0]
 
-    def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the history with this input."""
-        return push(x.line, u.u)
 
-
-class VariableDelay(StartsAtInput, Block):
+class VariableDelay(PastInputs):
     """Delay of a sampled subsystem that varies: y[k] = u(t_k − τ[k]), with straight lines between the samples of u.
 
     The delay is an input, from 0 to ``samples`` times the sample time; beyond it the run stops. Before the start u is
@@ -93,8 +64,11 @@ class VariableDelay(StartsAtInput, Block):
     u = Input(shape=None, description="signal to delay, a scalar or a vector")
     delay = Input(unit="s", description="delay τ")
     y = Output(like="u", description="the input τ ago")
-    line = History("samples", "initial_value", description="the last inputs, the oldest first, one row for each")
-    _rows = "samples"
+
+    @property
+    def kept(self) -> int:
+        """Number of past inputs that are remembered, as many as the longest delay."""
+        return self.samples
 
     @property
     def drawn_inside(self) -> str:
@@ -114,10 +88,6 @@ class VariableDelay(StartsAtInput, Block):
             share = np.where(distance >= 1.0, 0.0, 1.0 - distance)  # a delay that is NaN gives NaN
             y = y + share * (u.u if n == 0 else x.line[-n])
         return y
-
-    def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the history with this input."""
-        return push(x.line, u.u)
 
 
 class TransportDelay(Block):

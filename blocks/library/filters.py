@@ -1,88 +1,17 @@
-"""Linear blocks of sampled subsystems: integrator and filters."""
+"""Filters of sampled subsystems: FIR, moving average, IIR."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
 
 from ..core import Array, Block, Input, Output, ParameterError, State, kinds, lay_out, parameter
-from .branching import truth
-from .delays import History, push
-from .initial_values import StartsAtInput
-from .integrators import check_limits, clip
 from .linear import section
-
-_WEIGHTS = {"forward": (0.0, 1.0), "backward": (1.0, 0.0), "trapezoidal": (0.5, 0.5)}
-
-
-class DiscreteIntegrator(Block):
-    """Discrete integrator: a sum in place of an integral, by one of three rules, element by element.
-
-    ``forward`` y[k] = y[k − 1] + T u[k − 1], ``backward`` y[k] = y[k − 1] + T u[k], ``trapezoidal`` y[k] = y[k − 1] + T
-    (u[k − 1] + u[k]) / 2. Before the first tick the input counts as zero. With limits every sum is limited, so that
-    nothing winds up. At a rising edge of ``reset`` the sum restarts in the same tick, from ``initial_value`` or, with
-    ``reset_to_input``, from the input ``value``. A signal that is true at the start is no edge. The secondary output
-    ``before`` is the sum over the past ticks, before a reset, without feedthrough.
-
-    Raises
-    ------
-    ParameterError
-        For another rule, limits in the wrong order, and an ``initial_value`` outside of them.
-    SampleTimeError
-        In a continuous subsystem, when the diagram is built.
-    """
-
-    method: str = parameter(
-        default="forward",
-        description="'forward', 'backward' or 'trapezoidal'",
-        kind=kinds.choice(*_WEIGHTS).worded(f"one of {', '.join(map(repr, _WEIGHTS))}"),
-    )
-    gain: float = parameter(default=1.0, description="factor of the input")
-    initial_value: Array = parameter(default=0.0, description="the sum at the start, a number or of the input's shape")
-    lower: float | None = parameter(default=None, description="lower limit of y; None: there is none")
-    upper: float | None = parameter(default=None, description="upper limit of y; None: there is none")
-    reset_to_input: bool = parameter(default=False, description="True adds the input value, to which y is reset")
-    u = Input(shape=None, description="signal to integrate, of any shape")
-    reset = Input(default=0.0, description="logic: a rising edge resets")
-    value = Input(shape=None, description="value after a reset; with reset_to_input only")
-    y = Output(shape=None, description="the integral")
-    before = Output(shape=None, secondary=True, description="the sum over the past ticks, before a reset in this one")
-    total = State(start="initial_value", like="u", description="the sum over the past ticks")
-    last = State(start=1.0, description="reset at the last tick")
-
-    def check(self) -> None:
-        """Refuse limits that the sum can't keep."""
-        check_limits(self, "initial_value")
-
-    @property
-    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """``u``, ``reset``, and with ``reset_to_input`` ``value``."""
-        cls = type(self)
-        own = {"u": cls.u, "reset": cls.reset}
-        return {**own, "value": cls.value} if self.reset_to_input else own
-
-    def sums(self, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
-        """Return y, and the sum from which the next tick starts."""
-        target = u.value if self.reset_to_input else self.initial_value
-        edge = truth(u.reset) * (1.0 - truth(x.last))
-        total = np.where(edge > 0.5, 0.0 * x.total + target, np.where(edge <= 0.5, x.total, edge))
-        now, then = _WEIGHTS[self.method]
-        area = self.gain * T * u.u
-        y = clip(total + now * area if now else total, self.lower, self.upper)
-        return y, clip(y + then * area if then else y, self.lower, self.upper)
-
-    def output(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
-        """Return the integral, and the sum over the past ticks."""
-        return self.sums(x, u, T)[0], x.total
-
-    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
-        """Return the sum that includes this tick, and ``reset``."""
-        return self.sums(x, u, T)[1], u.reset
+from .past_inputs import PastInputs
 
 
-class FIR(StartsAtInput, Block):
+class FIR(PastInputs):
     """FIR filter: y[k] = c₀ u[k] + c₁ u[k − 1] + … + c_n u[k − n], of a scalar or, element by element, of a vector.
 
     The inputs before the first tick are ``initial_value``; without it, the input just before t = 0: of a source that
@@ -103,24 +32,18 @@ class FIR(StartsAtInput, Block):
     initial_value: Array | None = parameter(default=None, description="earlier inputs; None: u just before t = 0")
     u = Input(shape=None, description="signal to filter, a scalar or a vector")
     y = Output(shape=None, description="the filtered input")
-    line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
-    _rows = "taps"
 
     @property
-    def taps(self) -> int:
-        """Number of past inputs that are kept."""
+    def kept(self) -> int:
+        """Number of past inputs that are remembered."""
         return len(self.coefficients) - 1
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the weighted sum."""
         return self.coefficients[0] * u.u + self.coefficients[1:][::-1] @ x.line
 
-    def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the history with this input."""
-        return push(x.line, u.u)
 
-
-class MovingAverage(StartsAtInput, Block):
+class MovingAverage(PastInputs):
     """Moving average: y[k] = (u[k] + u[k − 1] + … + u[k − n + 1]) / n, of a scalar or a vector.
 
     The sum is computed in full at each tick, so no rounding error builds up. The inputs before the first tick are
@@ -136,21 +59,15 @@ class MovingAverage(StartsAtInput, Block):
     initial_value: Array | None = parameter(default=None, description="earlier inputs; None: u just before t = 0")
     u = Input(shape=None, description="signal to average, a scalar or a vector")
     y = Output(like="u", description="the average of the last n inputs")
-    line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
-    _rows = "taps"
 
     @property
-    def taps(self) -> int:
-        """Number of past inputs that are kept."""
+    def kept(self) -> int:
+        """Number of past inputs that are remembered."""
         return self.samples - 1
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the average."""
         return (u.u + np.sum(x.line, axis=0)) / self.samples
-
-    def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the history with this input."""
-        return push(x.line, u.u)
 
 
 class IIR(Block):

@@ -1,15 +1,17 @@
-"""Integrators, plain, limited or resettable, and the filtered derivative."""
+"""Integrators, plain, limited, resettable or discrete, and the filtered derivative."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Event, Input, Output, ParameterError, ShapeError, State, parameter
+from ..core import Array, Block, Event, Input, Output, ParameterError, ShapeError, State, clip, kinds, parameter
 from .branching import truth
 from .initial_values import StartsAtInput
+
+_WEIGHTS = {"forward": (0.0, 1.0), "backward": (1.0, 0.0), "trapezoidal": (0.5, 0.5)}
+"""Shares of this tick's and of the last tick's input in a sum, by rule."""
 
 
 class Integrator(Block):
@@ -48,10 +50,10 @@ def check_limits(block: Any, start: str | None = None) -> None:
         )
 
 
-def clip(value: Array, lower: Array | None, upper: Array | None) -> Array:
-    """Return a value within limits; NaN passes through (a traced np.clip loses it)."""
-    value = value if upper is None else np.where(value > upper, upper, value)
-    return value if lower is None else np.where(value < lower, lower, value)
+def restart_at_edge(total: Array, target: Array, reset: Array, last: Array) -> Array:
+    """Return a sum at a tick: ``target`` at a rising edge of ``reset``, known from its last value; NaN passes."""
+    edge = truth(reset) * (1.0 - truth(last))
+    return np.where(edge > 0.5, target, np.where(edge <= 0.5, total, edge))
 
 
 def _excess(y: Array, lower: Array | None, upper: Array | None) -> tuple[Array, Array]:
@@ -173,15 +175,20 @@ class ResettableIntegrator(_Limits, Block):
     upper: float | None = parameter(default=None, description="upper limit of y; None: there is none")
     u = Input(shape=None, description="signal to integrate; with limits a scalar in a continuous subsystem")
     reset = Input(description="logic: a rising edge resets")
-    value = Input(shape=None, description="value after a reset; with reset_to_input only")
+    value = Input(shape=None, description="value after a reset; with reset_to_input only", only_if="reset_to_input")
     y = Output(like="u", description="the integral")
     before = Output(like="u", secondary=True, description="the integral before a reset in this tick")
     integral = State(start="initial_value", like="u", description="the integral")
     last = State(start=1.0, discrete=True, description="reset at the last tick, in a sampled subsystem")
-    side = State(like="u", discrete=True, description="1 while held at the upper limit, −1 at the lower; with limits")
+    side = State(
+        like="u",
+        discrete=True,
+        description="1 while held at the upper limit, −1 at the lower; with limits",
+        only_if="has_limits",
+    )
     restart = Event("rising", "an edge of reset")
-    reached = Event("rising", "y reaches a limit; with limits")
-    released = Event("rising", "the input turns inward; with limits")
+    reached = Event("rising", "y reaches a limit; with limits", only_if="has_limits")
+    released = Event("rising", "the input turns inward; with limits", only_if="has_limits")
 
     def check(self) -> None:
         """Refuse limits that y can't keep."""
@@ -192,36 +199,14 @@ class ResettableIntegrator(_Limits, Block):
         """Whether there are limits."""
         return self.lower is not None or self.upper is not None
 
-    @property
-    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """``u``, ``reset``, and with ``reset_to_input`` ``value``."""
-        cls = type(self)
-        own = {"u": cls.u, "reset": cls.reset}
-        return {**own, "value": cls.value} if self.reset_to_input else own
-
-    @property
-    def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """``integral``, ``last``, and with limits ``side``."""
-        cls = type(self)
-        own = {"integral": cls.integral, "last": cls.last}
-        return {**own, "side": cls.side} if self.has_limits else own
-
-    @property
-    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """``restart``, and with limits ``reached`` and ``released``."""
-        cls = type(self)
-        own = {"restart": cls.restart}
-        return {**own, "reached": cls.reached, "released": cls.released} if self.has_limits else own
-
     def reset_value(self, x: Any, u: Any) -> Array:
         """Return y after a reset, of the integral's shape."""
         target = u.value if self.reset_to_input else self.initial_value
         return clip(0.0 * x.integral + target, self.lower, self.upper)
 
     def value_at_tick(self, x: Any, u: Any) -> Array:
-        """Return y at a tick; NaN passes through."""
-        edge = truth(u.reset) * (1.0 - truth(x.last))
-        return np.where(edge > 0.5, self.reset_value(x, u), np.where(edge <= 0.5, x.integral, edge))
+        """Return y at a tick."""
+        return restart_at_edge(x.integral, self.reset_value(x, u), u.reset, x.last)
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> tuple[Array, Array]:
         """Return the integral after and before a reset in this tick."""
@@ -249,6 +234,63 @@ class ResettableIntegrator(_Limits, Block):
         """Return the integral at the next tick."""
         new = clip(self.value_at_tick(x, u) + T * u.u, self.lower, self.upper)
         return (new, u.reset, self.find_side(new)) if self.has_limits else (new, u.reset)
+
+
+class DiscreteIntegrator(Block):
+    """Discrete integrator: a sum in place of an integral, by one of three rules, element by element.
+
+    ``forward`` y[k] = y[k − 1] + T u[k − 1], ``backward`` y[k] = y[k − 1] + T u[k], ``trapezoidal`` y[k] = y[k − 1] + T
+    (u[k − 1] + u[k]) / 2. Before the first tick the input counts as zero. With limits every sum is limited, so that
+    nothing winds up. At a rising edge of ``reset`` the sum restarts in the same tick, from ``initial_value`` or, with
+    ``reset_to_input``, from the input ``value``. A signal that is true at the start is no edge. The secondary output
+    ``before`` is the sum over the past ticks, before a reset, without feedthrough.
+
+    Raises
+    ------
+    ParameterError
+        For another rule, limits in the wrong order, and an ``initial_value`` outside of them.
+    SampleTimeError
+        In a continuous subsystem, when the diagram is built.
+    """
+
+    method: str = parameter(
+        default="forward",
+        description="'forward', 'backward' or 'trapezoidal'",
+        kind=kinds.choice(*_WEIGHTS).worded(f"one of {', '.join(map(repr, _WEIGHTS))}"),
+    )
+    gain: float = parameter(default=1.0, description="factor of the input")
+    initial_value: Array = parameter(default=0.0, description="the sum at the start, a number or of the input's shape")
+    lower: float | None = parameter(default=None, description="lower limit of y; None: there is none")
+    upper: float | None = parameter(default=None, description="upper limit of y; None: there is none")
+    reset_to_input: bool = parameter(default=False, description="True adds the input value, to which y is reset")
+    u = Input(shape=None, description="signal to integrate, of any shape")
+    reset = Input(default=0.0, description="logic: a rising edge resets")
+    value = Input(shape=None, description="value after a reset; with reset_to_input only", only_if="reset_to_input")
+    y = Output(shape=None, description="the integral")
+    before = Output(shape=None, secondary=True, description="the sum over the past ticks, before a reset in this one")
+    total = State(start="initial_value", like="u", description="the sum over the past ticks")
+    last = State(start=1.0, description="reset at the last tick")
+
+    def check(self) -> None:
+        """Refuse limits that the sum can't keep."""
+        check_limits(self, "initial_value")
+
+    def sums(self, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
+        """Return y, and the sum from which the next tick starts."""
+        target = u.value if self.reset_to_input else self.initial_value
+        total = restart_at_edge(x.total, 0.0 * x.total + target, u.reset, x.last)
+        now, then = _WEIGHTS[self.method]
+        area = self.gain * T * u.u
+        y = clip(total + now * area if now else total, self.lower, self.upper)
+        return y, clip(y + then * area if then else y, self.lower, self.upper)
+
+    def output(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
+        """Return the integral, and the sum over the past ticks."""
+        return self.sums(x, u, T)[0], x.total
+
+    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
+        """Return the sum that includes this tick, and ``reset``."""
+        return self.sums(x, u, T)[1], u.reset
 
 
 class FilteredDerivative(StartsAtInput, Block):

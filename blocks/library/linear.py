@@ -180,17 +180,16 @@ class _TransferFunction(Block):
     output_names: Names = parameter(default=None, description="name of the output, for python-control")
     u = Input(description="input")
     y = Output(description="output")
-    x = State(start=lambda block: np.zeros(block.order), description="state, as many numbers as the order")
+    x = State(
+        start=lambda block: np.zeros(block.order),
+        description="state, as many numbers as the order; of order 0 there is none",
+        only_if="order",
+    )
 
     @property
     def order(self) -> int:
         """Degree of the denominator."""
         return int(np.atleast_1d(self.denominator).shape[0]) - 1
-
-    @property
-    def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """``x``; none if the transfer function is a number."""
-        return {"x": type(self).x} if self.order else {}
 
     def check(self) -> None:
         """Refuse coefficients that don't make a proper transfer function."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import Array, Block, GuardError, Input, Output, ParameterError, ShapeError, kinds, parameter, shape_of
+from ..core import Array, Block, GuardError, Input, Output, ParameterError, ShapeError, clip, kinds, parameter, shape_of
 from .piecewise_functions import bilinear, piecewise
 
 _BEYOND = kinds.choice("hold", "extrapolate", "error")
@@ -16,10 +16,9 @@ _BREAKPOINTS = kinds.rising.worded(step="Sort them, with their values, and leave
 _SLACK = 1e-9  # part of the table's range by which rounding may put an input outside
 
 
-def _clip(points: np.ndarray, u: Array) -> Array:
-    """Return u within the ends of the table; NaN passes through."""
-    low, high = float(points[0]), float(points[-1])
-    return np.where(u < low, low, np.where(u > high, high, u))
+def _keep_within(points: np.ndarray, u: Array) -> Array:
+    """Return u within the ends of the table."""
+    return clip(u, float(points[0]), float(points[-1]))
 
 
 class _End(NamedTuple):
@@ -128,7 +127,7 @@ class Lookup1D(Block):
         if len(shape) > (0 if columns else 1):
             expected = "a scalar, since the values are vectors" if columns else "a scalar or a vector"
             raise ShapeError(f"found shape {shape}; expected {expected}. Look up one part at a time, u[0].", port="u")
-        inside = u.u if self.beyond == "extrapolate" else _clip(self.breakpoints, u.u)
+        inside = u.u if self.beyond == "extrapolate" else _keep_within(self.breakpoints, u.u)
         entries = [inside[i] for i in range(shape[0])] if shape else [inside]
         found = [piecewise(self.breakpoints, self._coefficients, entry) for entry in entries]
         if columns:
@@ -187,7 +186,7 @@ class Lookup2D(Block):
         """Return the value of the table."""
         a, b = u.u1, u.u2
         if self.beyond != "extrapolate":
-            a, b = _clip(self.rows, a), _clip(self.columns, b)
+            a, b = _keep_within(self.rows, a), _keep_within(self.columns, b)
         return bilinear(self.rows, self.columns, self.values, a, b)
 
     def input_breaks(self) -> Mapping[str, Array]:

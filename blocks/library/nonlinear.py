@@ -6,7 +6,6 @@ a continuous one their jumps are events, so that the outputs are smooth in betwe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -22,6 +21,7 @@ from ..core import (
     SampleTimeError,
     State,
     check_shapes,
+    clip,
     parameter,
     shorten,
 )
@@ -169,20 +169,14 @@ class Backlash(Block):
         default=None, description="y at the start, limited to the band; None: y = u just before t = 0"
     )
     with_rate: bool = parameter(default=False, description="True adds the input rate, which events need")
+    u = Input(shape=None, description="position of the band, of any shape")
+    rate = Input(shape=None, description="time derivative of u; with with_rate only", only_if="with_rate")
     y = Output(like="u", description="position that is carried along")
     rest = State(like="u", discrete=True, description="y at rest; at ticks the last value")
     drive = State(like="u", discrete=True, description="1 when driven up, −1 when driven down, 0 at rest")
     push = Event("rising", "the lower end of the band takes y along")
     pull = Event("rising", "the upper end of the band takes y along")
     turn = Event("falling", "the signal turns, and y rests")
-
-    @property
-    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """``u``, and with ``with_rate`` ``rate``."""
-        ports = {"u": Input(shape=None, description="position of the band, of any shape", name="u")}
-        if self.with_rate:
-            ports["rate"] = Input(shape=None, description="time derivative of u", name="rate")
-        return ports
 
     def carry(self, y: Array, u: Any) -> Array:
         """Return y limited to the band; NaN passes through."""
@@ -256,11 +250,10 @@ class RateLimiter(StartsAtInput, Block):
     last = State(start="initial_value", like="u", description="y at the last tick; in a continuous subsystem y itself")
 
     def clip_change(self, change: Array, span: Array) -> Array:
-        """Return a change within the limits for a span of time; NaN passes through."""
+        """Return a change within the limits for a span of time."""
         falling = self.rising if self.falling is None else self.falling
         check_shapes(rising=self.rising, falling=falling, u=change)
-        high, low = self.rising * span, -falling * span
-        return np.where(change > high, high, np.where(change < low, low, change))
+        return clip(change, -falling * span, self.rising * span)
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
         """Return y."""

@@ -7,9 +7,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ..core import Array, Block, Event, Input, Output, ParameterError, State, kinds, parameter
+from ..core import Array, Block, Event, Input, Output, ParameterError, State, clip, kinds, parameter
 from ..tracing import find_hold, is_nonzero
-from .integrators import check_limits, clip
+from .integrators import check_limits
 
 _WAYS = ("back_calculation", "clamping", "none")
 _ONE_WAY = f"one of {', '.join(map(repr, _WAYS))}"
@@ -73,14 +73,20 @@ class PID(Block):
     initial_output: float | None = parameter(default=None, description="u at the start; None: the integral is zero")
     r = Input(description="set-point")
     y = Input(description="measured value")
-    actual = Input(description="true control signal, in the unit of u; with tracking only", tracks="u")
+    actual = Input(
+        description="true control signal, in the unit of u; with tracking only", tracks="u", only_if="tracking"
+    )
     u = Output(description="control signal")
     excess = Output(secondary=True, description="the part that the limits cut off, v − u")
-    integral = State(start=lambda block: block.initial_output or 0.0, description="I; where ki or another way moves it")
-    filtered = State(description="x_f; with filter_time")
-    clamped = State(discrete=True, description="1 while the integral is held; with clamping")
-    clamp = Event("rising", "v is beyond a limit and the integral drives it further; with clamping")
-    release = Event("rising", "v is inside again by the clearance; with clamping")
+    integral = State(
+        start=lambda block: block.initial_output or 0.0,
+        description="I; where ki or another way moves it",
+        only_if="has_integral",
+    )
+    filtered = State(description="x_f; with filter_time", only_if=lambda block: block.filter_time is not None)
+    clamped = State(discrete=True, description="1 while the integral is held; with clamping", only_if="clamps")
+    clamp = Event("rising", "v is beyond a limit and the integral drives it further; with clamping", only_if="clamps")
+    release = Event("rising", "v is inside again by the clearance; with clamping", only_if="clamps")
     filter_decay: ClassVar[Array]  # computed by constants
     filter_gain: ClassVar[Array]
     tracking_share: ClassVar[Array]
@@ -174,32 +180,15 @@ class PID(Block):
         return self.anti_windup == "back_calculation" and (self.has_limits or self.tracking)
 
     @property
-    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """``r``, ``y``, and with tracking ``actual``."""
-        cls = type(self)
-        return {"r": cls.r, "y": cls.y, **({"actual": cls.actual} if self.tracking else {})}
-
-    @property
-    def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """With anything that moves it ``integral``, with a filter ``filtered``, with clamping ``clamped``."""
-        cls, absent = type(self), self.absent_states
-        declared = {"integral": cls.integral, "filtered": cls.filtered, "clamped": cls.clamped}
-        return {name: port for name, port in declared.items() if name not in absent}
-
-    @property
     def absent_states(self) -> Mapping[str, str]:
         """The states that its parameters leave out, with the reason."""
-        absent = {}
-        if not self.has_integral:
-            absent["integral"] = (
-                "with ki = 0, without initial_output and without back-calculation by a tracking_time its integral is "
-                "0 at all times, so it is no state; give ki a value"
-            )
-        if self.filter_time is None:
-            absent["filtered"] = "without filter_time it has no derivative, so no filter's state; give filter_time"
-        if not self.clamps:
-            absent["clamped"] = "nothing clamps an integral, so no state says so; give anti_windup='clamping' and ki"
-        return absent
+        reasons = {
+            "integral": "with ki = 0, without initial_output and without back-calculation by a tracking_time its "
+            "integral is 0 at all times, so it is no state; give ki a value",
+            "filtered": "without filter_time it has no derivative, so no filter's state; give filter_time",
+            "clamped": "nothing clamps an integral, so no state says so; give anti_windup='clamping' and ki",
+        }
+        return {name: reason for name, reason in reasons.items() if name not in self.states}
 
     @property
     def idle_parameters(self) -> frozenset[str]:
@@ -213,11 +202,6 @@ class PID(Block):
             "c": self.kd != 0.0,
         }
         return frozenset(name for name, is_used in used.items() if not is_used)
-
-    @property
-    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """``clamp`` and ``release``, with clamping."""
-        return {"clamp": type(self).clamp, "release": type(self).release} if self.clamps else {}
 
     @property
     def starts_from_inputs(self) -> bool:

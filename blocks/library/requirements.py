@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -89,20 +88,18 @@ class Requirement(Block):
     violated_at = Output(unit="s", description="time of the first violation, −1 before")
     broken = State(discrete=True, description="1 from the first violation on")
     when = State(unit="s", start=-1.0, discrete=True, description="time of the first violation, −1 before")
-    below = Event("rising", "the signal falls below its lower bound")
-    above = Event("rising", "the signal rises above its upper bound")
+    below = Event(
+        "rising",
+        "the signal falls below its lower bound, or a logic signal becomes false",
+        only_if=lambda block: block.lower is not None or block.upper is None,
+    )
+    above = Event("rising", "the signal rises above its upper bound", only_if=lambda block: block.upper is not None)
 
     def check(self) -> None:
         """Refuse bounds that cross."""
         if self.lower is not None and self.upper is not None and self.lower > self.upper:
             text = f"found lower={self.lower:g} above upper={self.upper:g}; expected it at or below. Exchange them."
             raise ParameterError(text, port="lower")
-
-    @property
-    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """One event for each bound; a logic signal can only fall."""
-        low = {"below": type(self).below} if self.lower is not None or self.upper is None else {}
-        return low | ({"above": type(self).above} if self.upper is not None else {})
 
     def margins(self, u: Array) -> tuple[Array, ...]:
         """Return the distances of u below and above its bounds, one for each event; negative within."""

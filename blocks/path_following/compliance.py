@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ..core import Array, Block, Event, Input, Output, ParameterError, State, parameter
+from ..core import Array, Block, Event, Input, Output, ParameterError, State, clip, parameter
 from ..tracing import find_hold
 
 
@@ -114,8 +114,8 @@ class AdmittanceFilter(Block):
         description="1 after a tick in which a limit acted: the states are then r^p and ṙ^p, not e and ė; in a "
         "continuous subsystem 1 with a speed limit, 2 while ṙ^p is held at it",
     )
-    reached = Event("rising", "the speed limit is reached; with velocity_limit")
-    released = Event("rising", "the acceleration turns inward; with velocity_limit")
+    reached = Event("rising", "the speed limit is reached; with velocity_limit", only_if="has_speed_limit")
+    released = Event("rising", "the acceleration turns inward; with velocity_limit", only_if="has_speed_limit")
 
     @property
     def has_limits(self) -> bool:
@@ -123,30 +123,29 @@ class AdmittanceFilter(Block):
         return self.velocity_limit is not None or self.acceleration_limit is not None
 
     @property
+    def has_speed_limit(self) -> bool:
+        """Whether the speed of the path reference is bounded, by events in a continuous subsystem."""
+        return self.velocity_limit is not None
+
+    @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """``error``, ``error_rate``, and with limits ``limited``."""
+        """``error``, ``error_rate``, and with limits ``limited``, which events change where the speed is limited."""
         cls = type(self)
         free = {"error": cls.error, "error_rate": cls.error_rate}
         if not self.has_limits:
             return free
-        events = self.velocity_limit is not None
-        return {**free, "limited": State(None, cls.limited.description, discrete=events, name="limited")}
-
-    @property
-    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """``reached`` and ``released``, with a speed limit."""
-        cls = type(self)
-        return {} if self.velocity_limit is None else {"reached": cls.reached, "released": cls.released}
+        about = cls.limited.description
+        return {**free, "limited": State(None, about, discrete=self.has_speed_limit, name="limited")}
 
     @property
     def starts_from_inputs(self) -> bool:
         """Whether the states are r^p and ṙ^p from the start."""
-        return self.velocity_limit is not None
+        return self.has_speed_limit
 
     def initial(self, u: Any) -> tuple[Any, ...]:
         """Return r^p, an admissible ṙ^p, and 1."""
         top: Any = self.velocity_limit
-        return u.reference[0], _clip(u.reference[1], -top, top), 1.0
+        return u.reference[0], clip(u.reference[1], -top, top), 1.0
 
     def check(self) -> None:
         """Refuse a damping that is given twice, or not at all."""
@@ -190,7 +189,7 @@ class AdmittanceFilter(Block):
         e_rate = np.where(after_cut, x.error_rate - u.reference[1], x.error_rate)
         if self.velocity_limit is not None:
             v = u.reference[1] + e_rate
-            admissible = _clip(v, -self.velocity_limit, self.velocity_limit)
+            admissible = clip(v, -self.velocity_limit, self.velocity_limit)
             e_rate = np.where(v == admissible, e_rate, admissible - u.reference[1])
         return e, e_rate
 
@@ -207,10 +206,10 @@ class AdmittanceFilter(Block):
         cut, acts = wanted, wanted != wanted
         if self.velocity_limit is not None:
             acts = np.abs(v_d + a_d * T + free[1]) > self.velocity_limit
-            cut = _clip(cut, (-self.velocity_limit - v) / T, (self.velocity_limit - v) / T)
+            cut = clip(cut, (-self.velocity_limit - v) / T, (self.velocity_limit - v) / T)
         if self.acceleration_limit is not None:
             acts = np.logical_or(acts, np.abs(wanted) > self.acceleration_limit)
-            cut = _clip(cut, -self.acceleration_limit, self.acceleration_limit)
+            cut = clip(cut, -self.acceleration_limit, self.acceleration_limit)
         new = (
             np.where(acts, p + v * T + 0.5 * cut * T**2, free[0]),
             np.where(acts, v + cut * T, free[1]),
@@ -239,7 +238,7 @@ class AdmittanceFilter(Block):
         wanted = u.reference[2] + self.acceleration(e, e_rate, self.driving_acceleration(u))
         if self.acceleration_limit is None:
             return wanted
-        return _clip(wanted, -self.acceleration_limit, self.acceleration_limit)
+        return clip(wanted, -self.acceleration_limit, self.acceleration_limit)
 
     def limited_acceleration(self, x: Any, u: Any) -> Array:
         """Return r̈^p in continuous time: zero while ṙ^p is held at its limit."""
@@ -264,8 +263,3 @@ class AdmittanceFilter(Block):
     def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, ...]:
         """Return the states at the next tick."""
         return self.step(x, u, T)[0]
-
-
-def _clip(value: Array, low: Array, high: Array) -> Array:
-    """Return a value within limits; NaN passes through (a traced np.clip loses it)."""
-    return np.where(value < low, low, np.where(value > high, high, value))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
+    PID,
     Block,
     Constant,
     DefinitionError,
@@ -105,3 +106,68 @@ def test_an_input_that_is_missing_is_named_and_one_with_a_default_is_not_asked_f
 def test_a_default_is_no_place_for_an_injection():
     with pytest.raises(UnknownNameError, match=r"there is no signal 'adds\.b'"):
         Diagram("d", Adds(name="adds")(Constant(value=1.0))).linearize(inputs="adds.b", step=0.1)
+
+
+class Leaks(Block):
+    """ẏ = u − k y, with the rate as an output where it is asked for, and a flow out where there is a hole."""
+
+    hole: bool = parameter(default=False)
+    with_rate: bool = parameter(default=False)
+    u = Input()
+    k = Input(only_if="hole")
+    y = State(output=True)
+    rate = Output(secondary=True, only_if=lambda block: block.with_rate)
+
+    def slope(self, x, u):
+        return u.u - u.k * x.y if self.hole else u.u
+
+    def output(self, t, x, u):
+        return self.slope(x, u)
+
+    def derivative(self, t, x, u):
+        return self.slope(x, u)
+
+
+class Drains(Leaks):
+    """The same with a further input."""
+
+    v = Input()
+
+    def slope(self, x, u):
+        return super().slope(x, u) - u.v
+
+
+def test_a_port_with_a_condition_is_one_of_those_blocks_alone_that_fulfil_it():
+    one = Constant(value=1.0)
+    run = Diagram("d", Leaks(hole=True, with_rate=True, name="tank")(one, one)).simulate(1.0, step=0.5)
+    assert run["tank.y"] == pytest.approx(1.0 - np.exp(-run.t), abs=1e-6)
+    assert run["tank.rate"] == pytest.approx(np.exp(-run.t), abs=1e-6)
+    plain = Leaks(name="tank")
+    assert list(plain.inputs) == ["u"]
+    assert list(plain.outputs) == ["y"]
+    assert Diagram("d", plain(one)).simulate(1.0, step=0.5)["tank.y"] == pytest.approx([0.0, 0.5, 1.0])
+    with pytest.raises(AttributeError, match="tank: with these parameters it has no output 'rate'"):
+        plain.rate.named("rate")
+
+
+def test_a_class_below_has_the_conditional_ports_and_its_own():
+    assert list(Drains(hole=True, name="d").inputs) == ["u", "k", "v"]
+    assert list(Drains(name="d").inputs) == ["u", "v"]
+    one = Constant(value=1.0)
+    run = Diagram("d", Drains(name="tank")(one, Constant(value=3.0))).simulate(1.0, step=0.5)
+    assert run["tank.y"] == pytest.approx([0.0, -1.0, -2.0])
+
+
+def test_a_subclass_of_a_block_with_conditional_ports_has_its_own_input():
+    class Biased(PID):
+        bias = Input()
+
+    assert list(Biased(kp=1.0, tracking=True).inputs) == ["r", "y", "actual", "bias"]
+
+
+def test_a_condition_that_is_no_parameter_is_refused_where_it_is_declared():
+    with pytest.raises(DefinitionError, match=r"Tank\.k: found only_if='hol'; .* Did you mean 'hole'"):
+
+        class Tank(Block):
+            hole: bool = parameter(default=False)
+            k = Input(only_if="hol")
