@@ -16,10 +16,7 @@ the parts of a PI law: no cut is made ahead of one of them. Nor is one where wha
 and sampled blocks alone read it: that is a measurement, such as the angle that two loops of a drive follow.
 
 Where this leaves several entries, parallel parts of a plant can't be distinguished from a plant and a model of it, as
-their graphs are the same: the cuts ahead of each are then as possible as that for all of them. One case is decided, as
-a sampled law's own models are sampled with it: a sampled signal acts on blocks in continuous time alone, none of which
-leads to another, and their outputs come back to sampled blocks as one signal. They are parts of one plant, and the loop
-is that at the law's output. A model that is simulated so says it by `Input(models_plant=True)`.
+their graphs are the same: the cuts ahead of each are then as possible as that for all of them.
 """
 
 from __future__ import annotations
@@ -56,7 +53,6 @@ class WaysBack:
     port: Port
     others: tuple[CutAhead, ...] = ()  # further cuts that nothing excludes, where several blocks may be the plant
     is_separable: bool = True  # whether one cut separates the plant's inputs from the controller's own
-    is_one_plant: bool = False  # whether the blocks of the further cuts are parts of one plant behind a sampled law
 
 
 def find_ways_back(flat: FlatDiagram, port: Port) -> WaysBack:
@@ -91,7 +87,7 @@ def find_ways_back(flat: FlatDiagram, port: Port) -> WaysBack:
     alone = [search.cut(port, inputs) for inputs in possible.values()] if is_parted else []
     found = tuple(sorted((cut for cut in alone if cut is not None), key=lambda cut: cut.to))
     if not own:
-        return WaysBack(every, (), port, found, is_one_plant=search.is_one_plant([*possible]))
+        return WaysBack(every, (), port, found)
     cut = search.cut(port, plant)
     if cut is None:
         return WaysBack(tuple(plant), tuple(sorted(own)), port, found, is_separable=False)
@@ -200,47 +196,6 @@ class _WaysFrom:
                     seen.add(one)
                     waiting += [consumer for consumer in self.consumers(one) if not self._ends_at(consumer[0])]
         return False
-
-    def is_one_plant(self, blocks: Sequence[str]) -> bool:
-        """Return whether blocks are parts of one plant: a sampled law drives them, and gets one signal of them back."""
-        outside = not any(_is_sampled(self.flat, block) or _is_fmu(self.flat, block) for block in blocks)
-        if not outside or not self._follows_sampled():
-            return False
-        returned = [self._returned(block, blocks) for block in blocks]
-        return returned[0] is not None and len(returned[0]) == 1 and all(one == returned[0] for one in returned)
-
-    def _follows_sampled(self) -> bool:
-        """Return whether the port follows sampled signals alone, through blocks without states."""
-        wires, seen, waiting = self.flat.table.wires.items(), set[str](), [self.port[0]]
-        while waiting:
-            path = waiting.pop()
-            if _is_sampled(self.flat, path) or path in seen:
-                continue
-            if _is_dynamic(self.flat, path):
-                return False
-            seen.add(path)
-            waiting += [wire.block for (block, _), wire in wires if block == path]
-        return True
-
-    def _returned(self, block: str, others: Sequence[str]) -> set[Port] | None:
-        """Return the ports by which a block's ways in continuous time come back to sampled blocks.
-
-        None where they lead through an FMU or another of the blocks.
-        """
-        outputs = [(block, port) for port in self.flat.table.blocks[block].outputs]
-        found, seen, waiting = set[Port](), set(outputs), outputs
-        while waiting:
-            here = waiting.pop()
-            for path, port in self.consumers(here):
-                if _is_sampled(self.flat, path):
-                    found.add(here)
-                elif _is_fmu(self.flat, path) or (path in others and path != block):
-                    return None
-                else:
-                    following = [one for one in self._outputs(path, port) if one not in seen]
-                    seen.update(following)
-                    waiting += following
-        return found
 
     def _ends_at(self, block: str) -> bool:
         return block == self.port[0] or _is_dynamic(self.flat, block)

@@ -73,7 +73,7 @@ def _place_at_plant(diagram: WiredDiagram, wire: str, flat: FlatDiagram) -> Loop
 
     def others(of: str) -> OtherCuts:
         at = {tap.port: wire, ways.port: of}
-        cuts = [cut for cut in ways.others if is_whole(cut.to) and not ways.is_one_plant]
+        cuts = [cut for cut in ways.others if is_whole(cut.to)]
         return tuple((at.get(cut.port, join(*cut.port)), tuple(join(*to) for to in cut.to)) for cut in cuts)
 
     if not ways.own or not ways.is_separable or not is_whole((*ways.plant, *ways.own)):

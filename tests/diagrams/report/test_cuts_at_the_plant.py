@@ -196,55 +196,6 @@ def test_a_pi_law_of_single_blocks_is_decided():
     assert {verdict for verdict, _ in verdicts(report).values()} == {Verdict.PASSED}
 
 
-def two_lags(returned):
-    """A sampled law that drives two lags in continuous time; ``returned`` makes what it gets of them."""
-    fast = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="fast")
-    slow = TransferFunction(numerator=[1.0], denominator=[5.0, 1.0], name="slow")
-
-    @subsystem(sample_time=T)
-    def controller(y, other=None):
-        return Gain(gain=-3.0, name="law")(y if other is None else y + other).named("u")
-
-    u = Saturation(limit=1e3, name="drive")(controller(*returned(fast.y, slow.y)))
-    return Diagram("lags", fast(u), slow(u))
-
-
-def test_parts_of_a_plant_behind_a_sampled_law_are_cut_together():
-    """At the law's output M_s = 8.7; ahead of one lag alone it is 7.4 and 2.3."""
-    z = np.exp(1j * np.linspace(1e-3, np.pi, 40001))
-    fast, slow = ((1.0 - a) / (z - a) for a in (np.exp(-T), np.exp(-T / 5.0)))
-    whole, at_fast = 3.0 * (fast + slow), 3.0 * fast / (1.0 + 3.0 * slow)
-    ms, ms_at_fast = (np.max(1.0 / np.abs(1.0 + L)) for L in (whole, at_fast))
-    for limit in (ms + 0.01, ms - 0.01, 0.5 * (ms + ms_at_fast)):
-        asked = Requirements(loops={"controller.u": {"ms": limit}})
-        report = two_lags(lambda y1, y2: (y1 + y2,)).report(only=("inner",), requirements=asked)
-        (result,) = (r for r in report.review.results if r.quantity == "ms")
-        assert result.number.value == pytest.approx(ms, rel=1e-6)
-        assert (result.verdict, result.reason) == (Verdict.PASSED if ms < limit else Verdict.FAILED, Reason.COMPARED)
-
-
-def sampled_law_with_observer():
-    """The pendulum's observer in continuous time, not declared, with a sampled law."""
-    plant = StateSpace.from_control(UPRIGHT, name="plant")
-    observer = OwnObserver(name="observer")
-    law = subsystem(sample_time=1e-3, name="law")(lambda x: StateFeedback(gain=K, name="gain")(x).y.named("force"))
-    force = law(observer.estimate)
-    return Diagram("balanced", plant(force), observer(u=force, y=plant.y))
-
-
-@pytest.mark.parametrize(
-    ("diagram", "wire"),
-    [
-        (lambda: two_lags(lambda y1, y2: (y1, y2)), "controller.u"),  # one may be a model: y + (ŷ − ŷ delayed)
-        (sampled_law_with_observer, "law.force"),
-    ],
-)
-def test_a_sampled_law_gets_more_than_one_signal_of_a_plant_and_a_model(diagram, wire):
-    found = place(diagram(), wire)
-    assert found.to == ()
-    assert len(found.others) == 2
-
-
 @pytest.mark.parametrize("wire", ["e", "y"])
 @pytest.mark.parametrize(("ms", "verdict"), [(2.6, Verdict.PASSED), (2.3, Verdict.FAILED)])
 def test_an_error_that_enters_a_sampled_pi_law_is_one_wire(wire, ms, verdict):
