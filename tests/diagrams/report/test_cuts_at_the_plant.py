@@ -19,6 +19,7 @@ from loopwright.blocks import (
     StateFeedback,
     StateSpace,
     TransferFunction,
+    TransportDelay,
 )
 from loopwright.diagrams import Diagram, Requirements, subsystem
 from loopwright.diagrams.requirements import Reason, Verdict
@@ -158,6 +159,17 @@ def test_a_verdict_is_open_beside_a_predictor_whose_blocks_are_side_by_side():
     assert place_of.to == ()
     assert ("u", ("plant.u",)) in place_of.others
     assert place(smith(), "controller.u").to == (("plant", "u"),)
+
+
+def test_a_verdict_is_open_beside_a_predictor_in_continuous_time_of_a_sampled_law():
+    """What comes back to the law is one signal, as of two parallel parts of a plant."""
+    plant = TransferFunction(numerator=[2.0], denominator=[10.0, 1.0], name="plant")
+    model = TransferFunction(numerator=[2.0], denominator=[10.0, 1.0], name="model")
+    law = subsystem(sample_time=0.1, name="law")(lambda e: Gain(gain=-1.5, name="gain")(e).y.named("u"))
+    u = law(TransportDelay(delay=8.0, name="dead_time")(plant.y) + model.y - TransportDelay(delay=8.0)(model.y))
+    found = place(Diagram("predicted", plant(u), model(u)), "law.u")
+    assert found.to == ()
+    assert {to for _, to in found.others} == {("plant.u",), ("model.u",)}
 
 
 def anti_windup(sample_time=None):
