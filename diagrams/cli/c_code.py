@@ -51,7 +51,12 @@ def _write(arguments: argparse.Namespace) -> Any:
         found = vars(module).get(name)
         if not isinstance(found, Subsystem):
             found = find_diagram(vars(module), path, name)
-        return to_c(found.diagram if isinstance(found, Experiment) else found, arguments.out, **options)
+        try:
+            return to_c(found.diagram if isinstance(found, Experiment) else found, arguments.out, **options)
+        except OptionError as error:
+            if error.block == to_c.__name__ and error.port in options:  # by the option's name on the command line
+                raise OptionError(error.message, port=f"--{error.port.replace('_', '-')}") from error
+            raise
 
 
 def _read_signal(path: Path) -> dict[str, np.ndarray]:

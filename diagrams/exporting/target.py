@@ -39,7 +39,15 @@ _LARGEST = 20_000
 """Operations of a tick that are written as text; a compiler takes long for more."""
 
 
-@accepts(folder=kinds.path, name=kinds.text.or_none(), number=kinds.choice("double", "float"), own_functions=kinds.flag)
+@accepts(
+    folder=kinds.path,
+    name=kinds.text.or_none(),
+    subsystem=kinds.text.or_none(),
+    outside=kinds.names,
+    outputs=kinds.names.or_none(),
+    number=kinds.choice("double", "float"),
+    own_functions=kinds.flag,
+)
 def to_c(
     model: object,
     folder: str | os.PathLike[str],

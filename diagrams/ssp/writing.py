@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Constant, OptionError, SspFileError, check_file, replace_file, same_unit
+from ...blocks.core import Constant, OptionError, SspFileError, accepts, check_file, kinds, replace_file, same_unit
 from ...fmus import Fmu
 from ...fmus.archive import FmuDescription, FmuVariable, read_description
 from ..flat import WiredDiagram
@@ -393,6 +393,7 @@ class Writer:
         yield from self.files.items()
 
 
+@accepts("{wired.name}", path=kinds.path, flat=kinds.flag)
 def write_ssp(
     wired: WiredDiagram,
     path: str | os.PathLike[str],

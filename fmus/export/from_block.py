@@ -156,7 +156,15 @@ def _state(block: Block, name: str, shape: Shape, shapes: dict[str, Shape]) -> V
     )
 
 
-@accepts(name=kinds.text, clocks=kinds.flag, own_functions=kinds.flag, arrays=kinds.flag)
+@accepts(
+    name=kinds.text,
+    communication=kinds.choice("any", "ticks"),
+    solver=kinds.text.or_none(),
+    clocks=kinds.flag,
+    start=kinds.mapping.or_none(),
+    own_functions=kinds.flag,
+    arrays=kinds.flag,
+)
 def build(
     block: Any,
     out: Path | str | None = None,
@@ -276,7 +284,7 @@ def build(
             subsystem=subsystem,
             outside=outside,
             outputs=outputs,
-            steps_on_ticks=_is_on_ticks(communication),
+            steps_on_ticks=communication == "ticks",
             offers_clocks=clocks,
             stop_time=stop_time,
             step_size=step_size,
@@ -322,14 +330,6 @@ def _refuse_options(model: object, **options: object) -> None:
             block=getattr(model, "name", None),
             port=given[0],
         )
-
-
-def _is_on_ticks(communication: str) -> bool:
-    if communication not in ("any", "ticks"):
-        raise OptionError(
-            f"found communication={communication!r}; expected 'any' or 'ticks'. Give one of them.", port="communication"
-        )
-    return communication == "ticks"
 
 
 def _check_exportable(block: object, name: str) -> None:

@@ -1,7 +1,7 @@
 """Calls of everything public with good arguments, for tests that spoil one of them."""
 
 import time
-from functools import cache
+from functools import cache, partial
 
 import control
 import numpy as np
@@ -423,6 +423,10 @@ def calls():
                 "own_functions": False,
             },
         ),
+        "Diagram.to_ssp": lambda: (
+            sampled().to_ssp,
+            {"path": "/nowhere/x.ssp", "stop": None, "step": None, "flat": False},
+        ),
         "read_ssp": lambda: (diagrams.read_ssp, {"file": "/nowhere/x.ssp", "variant": None}),
         "WebPage.save": lambda: (web_page().save, {"path": "/nowhere/page.html"}),
         "Simulation.run_realtime": lambda: (
@@ -484,6 +488,21 @@ def calls():
         "fmus.build": lambda: (
             fmus.build,
             {"block": Gain, "out": "/nowhere/x.fmu", "name": "i", "fmi": 3, "arrays": True, "platform": None},
+        ),
+        "fmus.build of a diagram": lambda: (
+            partial(fmus.build, platform="of no machine"),  # an error that ends before anything is compiled
+            {
+                "block": sampled(),
+                "name": "i",
+                "subsystem": None,
+                "outside": (),
+                "outputs": None,
+                "communication": "any",
+                "solver": None,
+                "clocks": False,
+                "start": None,
+                "own_functions": False,
+            },
         ),
         "Isolation": lambda: (
             fmus.Isolation,

@@ -44,6 +44,8 @@ def test_what_cannot_be_written_is_named_with_its_status(file, tmp_path, capsys)
     assert not (tmp_path / "out").exists()
     assert main(["c", f"{file}:loop", "--test", "signal.csv"]) == 2
     assert "--measure" in capsys.readouterr().err
+    assert main(["c", f"{file}:loop", "--name", "a b"]) == 2
+    assert "error: --name: found 'a b'; expected a C identifier, such as 'a_b'." in capsys.readouterr().err
 
 
 def test_the_files_come_as_json_and_the_users_file_is_executed_once(file, tmp_path, capsys):

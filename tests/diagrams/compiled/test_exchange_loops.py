@@ -7,6 +7,7 @@ from loopwright.blocks import Function, Gain, Relay, Sine, Sum
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
 from support.small_fmus import small_fmu, values
+from support.work_in_c import simulate_counted
 
 LAG = """
 typedef struct { double t, x, u; int mode; } instance;
@@ -119,3 +120,20 @@ def test_a_loop_that_is_nearly_singular_is_left_to_python(file):
     one, two = (made.simulate(1e-9, step=1e-9, solver="rk4", compile=c, progress=False) for c in (False, True))
     np.testing.assert_array_equal(one.data, two.data)
     np.testing.assert_allclose(two["k.y"], (1e8 - 1.0) * two["plant.x"], rtol=1e-6)
+
+
+def test_the_slope_of_a_stiff_method_solves_the_loop_again(file):
+    """u = 1.001 (y - sin t), y = x + u: u = 1001 (sin t - x), so x' = 1001 (sin t) - 1002 x, which is stiff.
+
+    With the loop's value held, the slope of the rate would be -1 and not -1002: Newton's method would not converge at
+    steps of more than about 1 ms, and the run would take thousands of steps.
+    """
+    lag = plant(file)
+    wave = Sine(frequency=1.0 / (2.0 * np.pi), name="wave")
+    made = Diagram("d", lag(u=Gain(gain=1.001, name="back")(lag.y - wave)), loops="solve")
+    run, work = simulate_counted(made, 2.0, step=0.1, solver="Radau", compile=False, rtol=1e-7, atol=1e-10)
+    a, t = 1002.0, run.t
+    forced = 1001.0 * (a * np.sin(t) - np.cos(t)) / (a * a + 1.0)
+    exact = forced + (1.0 + 1001.0 / (a * a + 1.0)) * np.exp(-a * t)
+    np.testing.assert_allclose(run["plant.x"], exact, rtol=0.0, atol=2e-6)  # 7e-7 of SciPy's Radau
+    assert work.steps < 400
