@@ -1,7 +1,7 @@
 """Linear models, operating points and trim."""
 
 from .block_slopes import linearize_block
-from .derivatives import Tap, find_signal, moves_between_ticks, wire_entries
+from .derivatives import moves_between_ticks
 from .flow_model import LinearDelays
 from .free_motions import FreeMotion, FreeMotions
 from .inserted_blocks import carry_point, cut_to, find_inputs, name_of_cut, name_wire_to, with_passed_values
@@ -46,6 +46,7 @@ from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_o
 from .plant_models import EQUILIBRIUM, PlantEquations, linearize_plant
 from .shared_wires import find_ways_back
 from .signal_paths import SignalPaths
+from .taps import Tap, find_signal, wire_entries
 from .trim_search import point_from_states, trim
 
 __all__ = [

@@ -17,7 +17,7 @@ import numpy as np
 from ..flat import FlatDiagram
 from ..wiring import join
 from .block_slopes import BlockSlopes, slopes_of
-from .derivatives import Tap, wire_entries
+from .taps import Tap, wire_entries
 
 POINTS = 24
 """Points at which the equations of a block are evaluated."""

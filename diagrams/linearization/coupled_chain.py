@@ -14,7 +14,7 @@ import numpy as np
 
 from ...blocks.core import OptionError, left_of
 from ..coupling import Links, Scheme, passes_slopes
-from ..flat import NONE, FlatDiagram
+from ..flat import NONE
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives
 from .plant_models import PlantModel, join_matrices
@@ -43,7 +43,6 @@ class LinearStep:
 class CoupledChain:
     """Communication steps of one scheme, linearized."""
 
-    flat: FlatDiagram
     local: LocalDerivatives
     links: Links
     order: tuple[str, ...]  # in which the FMUs step one after the other; empty for iterated coupling
@@ -99,9 +98,9 @@ class CoupledChain:
         self._check_rest(step, made, J["z"])
         S, H = (np.diag(part.astype(float)) for part in (links.moving & links.smooth_inputs, links.smooth_outputs))
         models = [made[path] for path in step.p_places]
-        A, B = (join_matrices(self.flat, models, which) for which in "AB")
+        A, B = (join_matrices(self.local.flat, models, which) for which in "AB")
         ends = [replace(m, C=m.y_by_states, D=m.y_by_inputs) for m in models]
-        C, D = (join_matrices(self.flat, ends, which) for which in "CD")
+        C, D = (join_matrices(self.local.flat, ends, which) for which in "CD")
         R = np.diag(self.straight.astype(float))
         x0 = step.x - 0.5 * flow_by_w @ H @ step.w  # and + 0.5 flow_by_w H w, with w at the end
         x1 = 0.5 * flow_by_w @ H
@@ -153,13 +152,14 @@ class CoupledChain:
             )
 
 
-def coupling_at(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> CoupledChain | None:
+def coupling_at(local: LocalDerivatives, at: OperatingPoint) -> CoupledChain | None:
     """Return the steps of the coupling of the run at a point; None where inputs are held from a step's beginning.
 
     The default coupling holds them. Where every input comes from sampled subsystems, every scheme does.
     """
-    for path, inputs in Links(flat).inputs.items():
-        if inputs.stop > inputs.start and passes_slopes(flat.table.blocks[path]):
+    links = Links(local.flat)
+    for path, inputs in links.inputs.items():
+        if inputs.stop > inputs.start and passes_slopes(local.flat.table.blocks[path]):
             raise OptionError(
                 "found input_derivatives among its options: its inputs are ramps over a communication step; expected "
                 "held inputs, which a linear model over communication steps has. Linearize the diagram with "
@@ -167,7 +167,6 @@ def coupling_at(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) 
                 block=path,
                 port="stepping",
             )
-    links = Links(flat)
     found = [path for path in links.paths if links.moving[links.inputs[path]].any()]
     if not at.coupling or not (found or links.felt.any()):
         return None
@@ -181,4 +180,4 @@ def coupling_at(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) 
             port="coupling",
         )
     one_by_one = at.coupling == Scheme.GAUSS_SEIDEL
-    return CoupledChain(flat, local, links, (at.coupling_order or links.order(())) if one_by_one else ())
+    return CoupledChain(local, links, (at.coupling_order or links.order(())) if one_by_one else ())

@@ -295,11 +295,11 @@ class DelayLine:
 
 
 def find_steady_slopes(
-    flat: FlatDiagram, local: LocalDerivatives, channels: DelayChannels, t: float, x: np.ndarray, w: np.ndarray
+    local: LocalDerivatives, channels: DelayChannels, t: float, x: np.ndarray, w: np.ndarray
 ) -> Numbers:
     """Return the derivatives between ticks, which must be constant: a delay puts out its input of another instant."""
     J = local.differentiate(NONE, t, x, w)
-    moves = np.max(np.abs(np.real(J["dx"])) / (1.0 + np.abs(x[flat.continuous])), initial=0.0) > EQUILIBRIUM
+    moves = np.max(np.abs(np.real(J["dx"])) / (1.0 + np.abs(x[local.flat.continuous])), initial=0.0) > EQUILIBRIUM
     if moves and not local.has_constant_slopes:
         raise OptionError(
             "found a transport delay in a nonlinear plant that is not at rest; expected a point at rest, or linear "

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...blocks.core import Finding, OptionError, explain_calls, left_of
 from ...fmus.running import Derivation
-from ..flat import NONE, FlatDiagram, WiredDiagram, announcers
+from ..flat import NONE, FlatDiagram, announcers
 from ..frequency import FourMatrices, find_pade_limit, hold_inputs, replace_delays
 from ..results import OperatingPoint
 from ..simulation import late_progress
@@ -64,9 +64,7 @@ class Model:
     delays: LinearDelays | None = None
 
 
-def differentiate_flow(
-    flat: FlatDiagram, local: LocalDerivatives, t: float, x1: np.ndarray, w: np.ndarray, h: float
-) -> FourMatrices:
+def differentiate_flow(local: LocalDerivatives, t: float, x1: np.ndarray, w: np.ndarray, h: float) -> FourMatrices:
     """Return the derivatives of x after the time h by x before it, by w and by d, and x after the time h.
 
     Only continuous states change. At an equilibrium, and everywhere where the flow is linear, the derivative is a
@@ -76,7 +74,7 @@ def differentiate_flow(
     An FMU in model exchange may depend on time without saying so. At an equilibrium it is asked at the instants at
     which DOP853 would ask it; where rates and derivatives are the same bits at all of them, they stay.
     """
-    xc = flat.continuous
+    flat, xc = local.flat, local.flat.continuous
     nc, nx, nw, m = len(xc), flat.width, len(w), local.n_inputs
     many = nx + nw + m
 
@@ -157,11 +155,9 @@ def _split_at_discontinuities(flat: FlatDiagram, t: float, end: float) -> Iterat
         t = edge
 
 
-def model_continuous(
-    diagram: WiredDiagram, flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint, plants: str | None
-) -> Model:
-    """Return the model of a diagram without sampling."""
-    J = local.differentiate(NONE, at.t, at.x, at.w)
+def model_continuous(local: LocalDerivatives, at: OperatingPoint, plants: str | None, name: str) -> Model:
+    """Return the model of a diagram without sampling; ``name`` is the diagram's."""
+    flat, J = local.flat, local.differentiate(NONE, at.t, at.x, at.w)
     models = local.model_equations(at, plants)
     xc = flat.continuous
     Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
@@ -171,7 +167,7 @@ def model_continuous(
         raise OptionError(
             "found a loop through the FMU's feedthrough without a unique solution; expected one. Wire an output "
             "without feedthrough, or linearize over a step, step=….",
-            block=diagram.name,
+            block=name,
         )
     channels = delay_channels(flat)
     S = np.zeros((len(at.w), len(channels)))

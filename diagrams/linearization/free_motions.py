@@ -33,13 +33,13 @@ from ..results import OperatingPoint
 from ..wiring import Wire, join
 from .absorbed_shifts import ShiftedBlock
 from .delay_channels import delay_channels
-from .derivatives import LocalDerivatives, Numbers, Tap, find_signal, wire_entries
-from .exchanged import evaluators_at, noise_of
+from .derivatives import LocalDerivatives, Numbers
+from .exchanged import noise_of
 from .flow_model import LinearDelays
-from .mean_stairs import replace_stairs
 from .over_a_period import find_needed, own_states
 from .plant_models import PlantModel, fmu_at, join_matrices, linearize_equations, plant_entries, plant_point
 from .signal_paths import SignalPaths
+from .taps import Tap, find_signal, wire_entries
 from .tick_chain import Chain, Visit, period_of
 
 NULL = 1e-12
@@ -435,10 +435,9 @@ class _Look:
         flat, at = model.wired.flatten_like(model.point), model.point
         watched, blocks = _watched(flat, model, required)
         cut, inputs = [find_signal(flat, wire) for wire in model.openings], [t for b in blocks for t in b.taps.values()]
-        means = replace_stairs(flat, at, model.stairs)
-        local = LocalDerivatives(flat, (), [*watched, *inputs], cut, evaluators_at(flat, at), means)
+        local = LocalDerivatives.at(flat, at, (), [*watched, *inputs], cut, model.stairs)
         make = _look_at_period if model.dt else _look_at_flow
-        instants, plants = make(model, flat, local, kept, np.arange(_count(watched)))
+        instants, plants = make(model, local, kept, np.arange(_count(watched)))
         return cls(flat, local, instants, plants, blocks, _nominals(flat, model, kept), noise)
 
     def seen(self, directions: np.ndarray, balance: np.ndarray) -> np.ndarray:
@@ -620,10 +619,10 @@ def _nominals(flat: FlatDiagram, model: ClosedModel, kept: list[int]) -> np.ndar
 
 
 def _look_at_flow(
-    model: ClosedModel, flat: FlatDiagram, local: LocalDerivatives, kept: list[int], watched: np.ndarray
+    model: ClosedModel, local: LocalDerivatives, kept: list[int], watched: np.ndarray
 ) -> tuple[list[_Instant], list[_PlantStep]]:
     """Return the one instant of a diagram without sampling, and steps of its FMUs from there."""
-    at = model.point
+    flat, at = local.flat, model.point
     J = local.differentiate(NONE, at.t, at.x, at.w)
     models = local.model_equations(at, model.plants)
     nc, n = len(flat.continuous), len(model.states)
@@ -647,10 +646,11 @@ def _look_at_flow(
 
 
 def _look_at_period(
-    model: ClosedModel, flat: FlatDiagram, local: LocalDerivatives, kept: list[int], watched: np.ndarray
+    model: ClosedModel, local: LocalDerivatives, kept: list[int], watched: np.ndarray
 ) -> tuple[list[_Instant], list[_PlantStep]]:
     """Return the instants at the ticks of a period and between them, and the steps of FMUs."""
-    chain = Chain(flat, local, model.point, model.plants, period_of(flat))
+    flat = local.flat
+    chain = Chain(local, model.point, model.plants, period_of(flat))
     chain.go_on()
     names, nx, n_p = chain.labels, flat.width, chain.n_p
     place = {name: i for i, name in enumerate(names)}

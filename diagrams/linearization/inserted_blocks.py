@@ -38,12 +38,12 @@ from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, layout_of
 from ..wiring import Structure, Wire, join
 from .block_slopes import slopes_of
-from .derivatives import find_signal, wire_entries
 from .kinks import read_arguments, read_log
 from .left_out_effects import BlockFinding, CutFromTracking, InertConsumer
 from .operating_points import PointLike, copy_point
 from .shared_wires import find_shared_cuts
 from .signal_paths import PathNode, SignalPaths
+from .taps import find_signal, wire_entries
 
 Port = tuple[str, str]
 STEP = 1e-3

@@ -53,19 +53,19 @@ from ..frequency import (
 from ..results import OperatingPoint
 from ..wiring import exact_time
 from .delay_channels import blocks_around
-from .derivatives import LocalDerivatives, Tap, find_moving, find_signal
-from .exchanged import derivations_at, evaluators_at, findings_on
+from .derivatives import LocalDerivatives, find_moving
+from .exchanged import derivations_at, findings_on
 from .flow_model import LinearDelays, Model, approximate_delays, model_continuous, relative_error
 from .free_motions import ClosedModel, FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .left_out_effects import EntryTaken
-from .mean_stairs import A_TREATMENT, replace_stairs
+from .mean_stairs import A_TREATMENT
 from .operating_points import PointLike, check_options, operating_point, refine_ticks
-from .over_a_period import begin_loop, confirm_loop, model_loop, model_period
+from .over_a_period import begin_loop, confirm_loop, model_at
 from .plant_models import A_WAY, EQUILIBRIUM
 from .signal_paths import SignalPaths
-from .tick_chain import period_of
+from .taps import Tap, find_signal
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -489,17 +489,18 @@ class Linearization(ShownAsTable):
             )
         flat = self.wired.flatten_like(self.point)
         ports = [find_signal(flat, w).port for w in wires]
-        at, frozen = begin_loop(flat, self.point, ports, self.plants, slow, self.wired.name, moves=bool(self.dt))
+        closed = LocalDerivatives.at(flat, self.point)
+        at, frozen = begin_loop(closed, self.point, ports, self.plants, slow, self.wired.name, moves=bool(self.dt))
         how: dict[str, Any] = {"plants": self.plants, "step": self.step, "stairs": self.stairs, "pade": self.pade}
         how |= {"frozen": frozen, "findings": self.findings}
         made = _linearize(self.wired, at, wires, wires, openings, loop=loop, **how)
         if loop:
             own = at is self.point and not self.openings and not frozen
-            closed = self if own else _linearize(self.wired, at, (), (), (), **how)
+            whole = self if own else _linearize(self.wired, at, (), (), (), **how)
             known = 0.0 if math.isnan(made.uncertainty) else made.uncertainty
             cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=known)
             cut.delays = made.delays
-            confirm_loop(cut, closed.A, wires, self.wired.name, closed.delays)
+            confirm_loop(cut, whole.A, wires, self.wired.name, whole.delays)
         return made
 
 
@@ -590,9 +591,8 @@ def linearize_within(
 def find_flow_poles(diagram: WiredDiagram, point: OperatingPoint) -> np.ndarray:
     """Return the poles in 1/s of what moves on between two ticks, with everything sampled held."""
     between = refine_ticks(diagram, point, 2)  # with ticks at which nothing acts, x holds all that is held there
-    flat = diagram.flatten_like(between)
-    local = LocalDerivatives(flat, (), (), (), evaluators_at(flat, between))
-    return _sorted_poles(model_continuous(diagram, flat, local, between, None).matrices[0])
+    local = LocalDerivatives.at(diagram.flatten_like(between), between)
+    return _sorted_poles(model_continuous(local, between, None, diagram.name).matrices[0])
 
 
 def _is_discrete(diagram: WiredDiagram, step: float | Fraction | None) -> bool:
@@ -646,27 +646,21 @@ def _linearize(
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
         _check_opening(flat, signal)
-    means = replace_stairs(flat, at, stairs)
-    channels = list[str]()
-    local = LocalDerivatives(flat, found[0], found[1], found[2], evaluators_at(flat, at), means)
-    # a sampled diagram's model is the map over a period, a continuous one's the derivatives at the instant
-    if _is_discrete(diagram, step):
-        if loop:
-            _check_loop(flat, local, at)
-        if loop and period_of(flat) > 1:
-            model, channels = model_loop(flat, local, at, plants, lifted=loop == "lifted", frozen=frozen)
-        else:
-            model = model_period(flat, local, at, plants, frozen, read_each=read_each)
-    else:
-        model = model_continuous(diagram, flat, local, at, plants)
-        model = approximate_delays(model, pade) if pade else model
+    local = LocalDerivatives.at(flat, at, *found, stairs)
+    discrete = _is_discrete(diagram, step)
+    if discrete and loop:
+        _check_loop(local, at)
+    model, channels = model_at(
+        local, at, plants, diagram.name, discrete=discrete, loop=loop, frozen=frozen, read_each=read_each
+    )
+    model = approximate_delays(model, pade) if pade else model
     A, B, C, D = model.matrices
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
     if channels:
         ins = outs = tuple(channels)
     if read_each:
         outs = tuple(f"{e}@{k}" for k in range(len(C) // max(1, len(outs))) for e in outs)
-    known = means.replace_findings(find_kinks(flat, at)) if findings is None else findings
+    known = local.stairs.replace_findings(find_kinks(flat, at)) if findings is None else findings
     entries = (EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
     methods, error = derivations_at(flat, at, model.derivations)
     every = tuple(dict.fromkeys((*known, *model.findings, *findings_on(methods), *at.free, *entries)))
@@ -732,9 +726,9 @@ def _as_list(given: str | Iterable[str]) -> list[str]:
     return [given] if isinstance(given, str) else list(given)
 
 
-def _check_loop(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> None:
+def _check_loop(local: LocalDerivatives, at: OperatingPoint) -> None:
     """Refuse the loop of a wire that changes between ticks and acts there."""
-    moving = find_moving(flat, local, at)
+    moving = find_moving(local, at)
     if moving:
         raise BetweenTicksError(
             f"{moving[0]!r} changes between ticks, and blocks in continuous time use it there; expected a loop that is "

@@ -26,12 +26,11 @@ from ...blocks.core import ConfirmationError, Finding, OptionError, PeriodicLoop
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..frequency import FourMatrices
 from ..results import OperatingPoint
-from .derivatives import LocalDerivatives, Tap, find_signal
-from .exchanged import evaluators_at
-from .flow_model import LinearDelays, Model
+from .derivatives import LocalDerivatives
+from .flow_model import LinearDelays, Model, model_continuous
 from .left_out_effects import MemoryActs
-from .mean_stairs import replace_stairs
 from .plant_models import EQUILIBRIUM
+from .taps import Tap, find_signal
 from .tick_chain import Chain, period_of
 
 SAME_ROWS = 1e-12
@@ -104,8 +103,31 @@ def _restrict(four: FourMatrices, keep: list[int]) -> FourMatrices:
     return A[np.ix_(keep, keep)], B[keep], C[:, keep], D
 
 
+def model_at(
+    local: LocalDerivatives,
+    at: OperatingPoint,
+    way: str | None,
+    name: str,
+    *,
+    discrete: bool,
+    loop: str = "",
+    frozen: frozenset[TickPattern] = NONE,
+    read_each: bool = False,
+    with_findings: bool = True,
+) -> tuple[Model, list[str]]:
+    """Return the linear model of a diagram at a point, and the names of a loop's channels where it has several ticks.
+
+    A sampled diagram's model is the map over a period, a continuous one's the derivatives at the instant. ``loop`` is
+    "one" or "lifted" where the model is that of a cut loop, ``name`` is the diagram's.
+    """
+    if not discrete:
+        return model_continuous(local, at, way, name), []
+    if loop and period_of(local.flat) > 1:
+        return model_loop(local, at, way, lifted=loop == "lifted", frozen=frozen)
+    return model_period(local, at, way, frozen, with_findings=with_findings, read_each=read_each), []
+
+
 def model_period(
-    flat: FlatDiagram,
     local: LocalDerivatives,
     at: OperatingPoint,
     way: str | None,
@@ -118,8 +140,9 @@ def model_period(
 
     With ``read_each`` it has the outputs of all ticks, one tick after the other.
     """
+    flat = local.flat
     period = period_of(flat, frozen)
-    chain = Chain(flat, local, at, way, period, frozen, every=read_each)
+    chain = Chain(local, at, way, period, frozen, every=read_each)
     chain.go_on()
     whole = lift(chain.steps, each_tick=False, read_each=read_each)
     names = chain.labels
@@ -232,13 +255,12 @@ def _readers(flat: FlatDiagram, port: tuple[str, str]) -> list[str]:
 
 
 def begin_loop(
-    flat: FlatDiagram,
+    closed: LocalDerivatives,
     at: OperatingPoint,
     ports: Sequence[tuple[str, str]],
     way: str | None,
     slow: str,
     name: str,
-    closed: LocalDerivatives | None = None,
     *,
     moves: bool = True,
 ) -> tuple[OperatingPoint, frozenset[TickPattern]]:
@@ -247,17 +269,17 @@ def begin_loop(
     Wires are renewed at that point. ``closed`` are the derivatives with nothing cut, ``moves`` says whether the model
     has ticks. With ``slow="open"`` the clocks slower than the wires' are frozen.
     """
+    flat = closed.flat
     frozen = find_slower_clocks(flat, ports, name) if slow == "open" else NONE
     count = ticks_to_renewal(flat, ports, at.tick) if moves and period_of(flat) > 1 else 0
     if not count:
         return at, frozen
-    chain = Chain(flat, closed or LocalDerivatives(flat, (), (), (), evaluators_at(flat, at)), at, way, count)
+    chain = Chain(closed, at, way, count)
     chain.go_on()
     return chain.here, frozen
 
 
 def model_loop(
-    flat: FlatDiagram,
     local: LocalDerivatives,
     at: OperatingPoint,
     way: str | None,
@@ -266,8 +288,9 @@ def model_loop(
     frozen: frozenset[TickPattern] = NONE,
 ) -> tuple[Model, list[str]]:
     """Return the model from the injected to the returning signals at the same wires, and the names of its channels."""
-    period, m = period_of(flat, frozen), local.n_inputs
-    chain = Chain(flat, local, at, way, period, frozen)
+    flat, m = local.flat, local.n_inputs
+    period = period_of(flat, frozen)
+    chain = Chain(local, at, way, period, frozen)
     chain.go_on()
     whole = lift(chain.steps, each_tick=True)
     keep = find_needed([whole], own_states(flat, chain))
@@ -421,9 +444,8 @@ def model_ticks(
     """Return the models of all ticks of a sampled diagram's period, and the names of their states."""
     flat = diagram.flatten_like(at)
     injected, measured, cut = ([find_signal(flat, name) for name in names] for names in (inputs, outputs, openings))
-    means = replace_stairs(flat, at, stairs)
-    local = LocalDerivatives(flat, injected, measured, cut, evaluators_at(flat, at), means)
-    chain = Chain(flat, local, at, None, period_of(flat))
+    local = LocalDerivatives.at(flat, at, injected, measured, cut, stairs)
+    chain = Chain(local, at, None, period_of(flat))
     chain.go_on()
     keep = find_needed(chain.steps, own_states(flat, chain))
     clocks = [_clock_of(flat, tap) for tap in injected]

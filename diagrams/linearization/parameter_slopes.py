@@ -20,13 +20,13 @@ from ..frequency import FourMatrices, delayed_system_class, replace_delays
 from ..results import OperatingPoint, layout_of
 from ..wiring import join
 from .delay_channels import delay_channels
-from .derivatives import LocalDerivatives, find_signal, join_slope, slope_of
-from .exchanged import evaluators_at
+from .derivatives import LocalDerivatives
+from .derivatives_along import DerivativesAlong, Direction, KnownModels, join_slope, slope_of
 from .flow_model import Model, model_continuous
 from .linear_model import Linearization
-from .mean_stairs import replace_stairs
-from .over_a_period import begin_loop, lift, model_loop, model_period
+from .over_a_period import begin_loop, lift, model_at
 from .plant_models import EQUILIBRIUM, join_matrices, plant_layout
+from .taps import find_signal
 from .tick_chain import Chain, period_of
 from .trim_request import Free, difference, free_parameters, locate, read_value, split_array, spread_nodes
 
@@ -109,10 +109,7 @@ def loop_of_variant(
     diagram = diagram.replace(at.parameters) if at.parameters else diagram
     flat = diagram.flatten_like(at)
     at.check_fits(flat, diagram.name)
-    taps = [find_signal(flat, w) for w in wires]
-    outside, means = evaluators_at(flat, at), replace_stairs(flat, at, model.stairs)
-    local, closed = (LocalDerivatives(flat, t, t, t, outside, means) for t in (taps, []))
-    made = _model_at(model, flat, diagram, at, local, closed, slow)
+    made = _model_at(model, at, diagram.name, *_derivatives(model, flat, at, wires), slow)
     rests = bool(np.max(np.abs(made.affine), initial=0.0) <= EQUILIBRIUM)
     A, B, C, D = _loop_matrices(made)
     if (late := made.delays) is not None:
@@ -146,23 +143,31 @@ def _rational_matrices(made: Model, order: int) -> FourMatrices:
     return replace_delays(A, B, C, D, late.G, late.Z, late.H, -late.E, late.F, late.times, orders)
 
 
+def _derivatives(
+    model: Linearization, flat: FlatDiagram, at: OperatingPoint, wires: Iterable[str]
+) -> tuple[LocalDerivatives, LocalDerivatives]:
+    """Return the derivatives with a loop cut at wires, and with all closed."""
+    taps = [find_signal(flat, w) for w in wires]
+    local, closed = (LocalDerivatives.at(flat, at, t, t, t, model.stairs) for t in (taps, []))
+    return local, closed
+
+
 def _model_at(
     model: Linearization,
-    flat: FlatDiagram,
-    diagram: WiredDiagram,
     at: OperatingPoint,
+    name: str,
     local: LocalDerivatives,
     closed: LocalDerivatives,
     slow: Literal["closed", "open"],
 ) -> Model:
-    """Return the model of a cut loop; ``closed`` are the derivatives with nothing cut."""
-    if not model.dt:
-        return model_continuous(diagram, flat, local, at, model.plants)
-    ports = [tap.port for tap in local.inputs]
-    at, frozen = begin_loop(flat, at, ports, model.plants, slow, diagram.name, closed)
-    if period_of(flat) == 1:
-        return model_period(flat, local, at, model.plants, frozen, with_findings=False)
-    return model_loop(flat, local, at, model.plants, lifted=False, frozen=frozen)[0]
+    """Return the model of a cut loop; ``closed`` are the derivatives with nothing cut, ``name`` is the diagram's."""
+    frozen = NONE
+    if model.dt:
+        at, frozen = begin_loop(closed, at, [tap.port for tap in local.inputs], model.plants, slow, name)
+    made, _ = model_at(
+        local, at, model.plants, name, discrete=bool(model.dt), loop="one", frozen=frozen, with_findings=False
+    )
+    return made
 
 
 class _Cut:
@@ -171,47 +176,44 @@ class _Cut:
     def __init__(self, model: Linearization, wires: tuple[str, ...], slow: Literal["closed", "open"]):
         self.model, self.wires, self.slow = model, wires, slow
         self.flat = model.wired.flatten_like(model.point)
-        self._known: dict[int, tuple[FlatDiagram, OperatingPoint, LocalDerivatives, LocalDerivatives]] = {}
+        self._known: dict[int, tuple[FlatDiagram, tuple[LocalDerivatives, LocalDerivatives], KnownModels]] = {}
 
-    def derivatives(self, flat: FlatDiagram, diagram: WiredDiagram) -> tuple[LocalDerivatives, LocalDerivatives]:
-        """Return the derivatives with the loop cut, and with all closed; their traces are kept."""
-        key, at = id(flat), self.model.point
-        if key not in self._known:
-            taps = [find_signal(flat, w) for w in self.wires]
-            outside, means = evaluators_at(flat, at), replace_stairs(flat, at, self.model.stairs)
-            made = [LocalDerivatives(flat, t, t, t, outside, means) for t in (taps, [])]
-            self._known[key] = (flat, at, made[0], made[1])
-        return self._known[key][2:]
+    def along(self, flat: FlatDiagram, direction: Direction) -> tuple[DerivativesAlong, DerivativesAlong]:
+        """Return the derivatives along a direction with the loop cut, and with all closed; their traces are kept."""
+        if id(flat) not in self._known:
+            self._known[id(flat)] = flat, _derivatives(self.model, flat, self.model.point, self.wires), {}
+        _, (local, closed), models = self._known[id(flat)]
+        return DerivativesAlong(local, direction, models), DerivativesAlong(closed, direction, models)
 
-    def loop(self, flat: FlatDiagram, diagram: WiredDiagram, at: OperatingPoint, direction: np.ndarray) -> FourMatrices:
-        """Return A, B, C, D of L with slopes along a direction of the parameters, at a point with slopes."""
-        local, closed = self.derivatives(flat, diagram)
-        local.direction = closed.direction = direction
-        made = _model_at(self.model, flat, diagram, at, local, closed, self.slow)
-        return _rational_matrices(made, self.model.pade)
+    def loop(
+        self, flat: FlatDiagram, diagram: WiredDiagram, at: OperatingPoint, direction: Direction
+    ) -> tuple[FourMatrices, float]:
+        """Return A, B, C, D of L with slopes along a direction, at a point with slopes, and the slopes' error."""
+        local, closed = self.along(flat, direction)
+        made = _model_at(self.model, at, diagram.name, local, closed, self.slow)
+        return _rational_matrices(made, self.model.pade), max(local.error, closed.error)
 
-    def rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: np.ndarray) -> OperatingPoint | None:
+    def rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: Direction) -> OperatingPoint | None:
         """Return the point with the slopes of the equilibrium that follows a parameter; None if none follows.
 
         It is kept as long as the model lives: it follows a parameter alike for all loops.
         """
-        known, key = _RESTS.setdefault(self.model, {}), (flat.p.tobytes(), direction.tobytes())
+        known, key = _RESTS.setdefault(self.model, {}), (flat.p.tobytes(), direction.by_p.tobytes())
         if key not in known:
             known[key] = self._find_rest(flat, diagram, direction)
         return known[key]
 
-    def _find_rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: np.ndarray) -> OperatingPoint | None:
+    def _find_rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: Direction) -> OperatingPoint | None:
         """Return the point of `rest`.
 
         The equations are x = f(x, p) over a period, so that (1 − ∂f/∂x) x′ = ∂f/∂p. The smallest solution is taken:
         states that nothing determines, as those of an integrator at rest, stay.
         """
         at, model = self.model.point, self.model
-        closed = self.derivatives(flat, diagram)[1]
-        closed.direction = direction
+        _, closed = self.along(flat, direction)
         start = replace(at, x=join_slope(at.x, np.zeros(at.x.size)))
         if not model.dt:
-            made = model_continuous(diagram, flat, closed, start, model.plants)
+            made = model_continuous(closed, start, model.plants, diagram.name)
             if at.plants:  # the outputs of FMUs in continuous time are not followed
                 return start if np.max(np.abs(slope_of(made.affine)), initial=0.0) <= LOST else None
             A, late, w = np.real(made.matrices[0]), made.delays, np.zeros(at.w.size)
@@ -229,7 +231,7 @@ class _Cut:
                 w[channels.outputs] = through @ (np.real(late.Z) @ moved + z)
                 return replace(at, x=join_slope(at.x, x), w=join_slope(at.w, w))
             return replace(at, x=join_slope(at.x, x))
-        chain = Chain(flat, closed, start, model.plants, period_of(flat))
+        chain = Chain(closed, start, model.plants, period_of(flat))
         chain.go_on()
         M = np.real(lift(chain.steps, each_tick=False)[0])
         moved = _smallest(M - np.eye(len(M)), -slope_of(chain.affine()))
@@ -392,13 +394,11 @@ class _Traced:
         found = []
         packed, error = free.slope(self.value)
         for i, name in entries:
-            direction = np.zeros(self.flat.p.size)
-            direction[free.where] = packed[:, i]
-            local, closed = cut.derivatives(self.flat, self.diagram)
-            local.scale = closed.scale = abs(float(self.value[i])) or 1.0
-            at, own, lost = self._point(direction, i)
-            local.error = closed.error = 0.0
-            four = cut.loop(self.flat, self.diagram, at, direction)
+            by_p = np.zeros(self.flat.p.size)
+            by_p[free.where] = packed[:, i]
+            direction = Direction(by_p, abs(float(self.value[i])) or 1.0)
+            at, error_of_point, lost = self._point(direction, i)
+            four, error_of_models = cut.loop(self.flat, self.diagram, at, direction)
             if not all(np.isfinite(np.concatenate([np.ravel(M) for M in four]))):
                 raise ParameterError(
                     f"found a derivative that is not finite at the value {self.value[i]:g}; expected a smooth "
@@ -407,12 +407,12 @@ class _Traced:
                     port=name,
                 )
             (A, B, C, D), (dA, dB, dC, dD) = map(np.real, four), map(slope_of, four)
-            worst = max(local.error, closed.error, own, float(error[i]))
+            worst = max(error_of_models, error_of_point, float(error[i]))
             eA, eB, eC, eD = (worst * (slope != 0.0) for slope in (dA, dB, dC, dD))
             found.append(LoopSlope(name, float(self.value[i]), (A, B, C, D), (dA, dB, dC, dD), (eA, eB, eC, eD), lost))
         return found
 
-    def _point(self, direction: np.ndarray, i: int) -> tuple[OperatingPoint, float, bool]:
+    def _point(self, direction: Direction, i: int) -> tuple[OperatingPoint, float, bool]:
         """Return the point with slopes, the error of the slopes, and whether an equilibrium is lost."""
         at = self.cut.model.point
         still = replace(at, x=join_slope(at.x, np.zeros(at.x.size)))

@@ -23,7 +23,8 @@ from ..results import OperatingPoint
 from .coupled_chain import LinearStep, coupling_at
 from .delay_channels import delay_channels
 from .delayed_flow import DelayedFlow, DelayLine, find_steady_slopes
-from .derivatives import LocalDerivatives, Numbers, slope_of
+from .derivatives import LocalDerivatives, Numbers
+from .derivatives_along import slope_of
 from .exchanged import noise_of
 from .flow_model import differentiate_flow
 from .left_out_effects import EventWithinPeriod, UnusualStart
@@ -84,7 +85,6 @@ class Chain:
 
     def __init__(
         self,
-        flat: FlatDiagram,
         local: LocalDerivatives,
         at: OperatingPoint,
         way: str | None,
@@ -93,7 +93,8 @@ class Chain:
         *,
         every: bool = False,
     ):
-        self._coupled = coupling_at(flat, local, at)
+        flat = local.flat
+        self._coupled = coupling_at(local, at)
         self.flat, self.local, self.way, self.frozen = flat, local, way, frozen
         self.first = self.here = at
         self.ticks = list(ticks_of_period(flat, at.tick, count, every=every))
@@ -219,7 +220,7 @@ class Chain:
         if not len(self._channels):
             return None
         flat, here = self.flat, self.here
-        J = find_steady_slopes(flat, self.local, self._channels, here.t, x1, here.w)
+        J = find_steady_slopes(self.local, self._channels, here.t, x1, here.w)
         if self._line is None:
             start, base = self.first.tick, flat.base
             times = [base * (k - start) for k, _ in self.ticks]
@@ -266,7 +267,7 @@ class Chain:
             and _are_same(known[2], here.w)
         ):
             return known[3]
-        found = differentiate_flow(self.flat, self.local, here.t, x1, here.w, h)
+        found = differentiate_flow(self.local, here.t, x1, here.w, h)
         if _are_same(found[3], x1):
             self._known_flow = (h, x1, here.w, found, self.local.stays_until(here.t))
         self._note_events(found[3], h)

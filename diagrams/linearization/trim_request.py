@@ -13,8 +13,8 @@ from ...blocks.tracing import extrapolate, traced_parameters
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin
 from ..wiring import change_parameter, explain_absent_state, find_place, index_of, split_entry
-from .derivatives import find_signal
 from .plant_models import plant_layout
+from .taps import find_signal
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu

@@ -28,7 +28,8 @@ from loopwright.diagrams.flat.clocks import NONE
 from loopwright.diagrams.flat.flat_layout import FlatLayout
 from loopwright.diagrams.flat.stages import OpaqueStage, TracedStage
 from loopwright.diagrams.flat.total_derivative import Derivative
-from loopwright.diagrams.linearization.derivatives import LocalDerivatives, find_signal
+from loopwright.diagrams.linearization.derivatives import LocalDerivatives
+from loopwright.diagrams.linearization.taps import find_signal
 from loopwright.diagrams.simulation.workspace import Workspace
 
 RNG = np.random.default_rng(9)

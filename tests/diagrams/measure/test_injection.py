@@ -22,7 +22,7 @@ from loopwright.blocks import (
     WiringError,
 )
 from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
-from loopwright.diagrams.linearization.derivatives import find_signal
+from loopwright.diagrams.linearization.taps import find_signal
 from loopwright.diagrams.measure.injection import inject_signal, times_of
 from loopwright.diagrams.measure.waveforms import compute_phasors, plan_signal
 from loopwright.diagrams.simulation import Simulation

@@ -1,0 +1,58 @@
+"""Taps: ports of a diagram, or entries of them, at which signals are injected, measured or cut."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...blocks.core import UnknownNameError, elements, near
+from ...blocks.tracing import size
+from ..flat import FlatDiagram
+from ..results import resolve
+from ..wiring import Wire, explain_absent_state, index_of, split_entry
+
+
+@dataclass(frozen=True)
+class Tap:
+    """A tap: an output port of a diagram, or entries of it."""
+
+    name: str
+    port: tuple[str, str]  # path of the block, and name of its port
+    entries: tuple[int, ...]  # numbers of the entries in the flat port
+    labels: tuple[str, ...]
+    entry: tuple[int, ...] = ()  # numbers of the entry that the name asks for, counted from 1; () for the whole
+
+
+def wire_entries(flat: FlatDiagram, wire: Wire) -> tuple[int, ...]:
+    """Return the numbers of the entries of a port that a wire takes."""
+    shape = flat.checked.shapes[wire.block, wire.port]
+    every = np.arange(size(shape)).reshape(shape)
+    return tuple(np.ravel(every if wire.index is None else every[wire.index]).tolist())
+
+
+def find_signal(flat: FlatDiagram, name: str) -> Tap:
+    """Return the port, or entries of one, that a name of a wire or port denotes."""
+    wires, ports = flat.table.names, flat.log.slices
+    if not isinstance(name, str):
+        raise UnknownNameError(f"found {name!r}; expected the name of a wire, or the path of a port. Give a text.")
+    name, entry = split_entry(name, {*wires, *ports})
+    try:
+        full = resolve(name, wires, ports, flat.table.blocks)
+    except UnknownNameError as error:
+        if error.candidates:
+            raise
+        known = {n.rpartition(".")[2] for n in (*wires, *ports)} | {*wires, *ports}
+        reason = explain_absent_state(flat.table.blocks, name)
+        step = f"{reason[0].upper()}{reason[1:]}" if reason else near(name, known)
+        raise UnknownNameError(f"there is no signal {name!r} in this diagram. {step}") from None
+    wire = wires[full] if full in wires else Wire(*flat.ports[full])
+    shape = flat.checked.shapes[wire.block, wire.port]
+    index = np.arange(size(shape)).reshape(shape)
+    part = index if wire.index is None else np.asarray(index[wire.index])
+    labels = np.array(elements(name if name in wires else full, part.shape)).reshape(part.shape)
+    if entry:
+        index_of_entry = index_of(entry, part.shape, full)
+        part, labels = part[index_of_entry], labels[index_of_entry]
+    flat_labels = tuple(str(e) for e in np.ravel(labels))
+    return Tap(name, (wire.block, wire.port), tuple(np.ravel(part).tolist()), flat_labels, entry)
