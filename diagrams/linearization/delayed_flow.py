@@ -18,14 +18,13 @@ import numpy as np
 
 from ...blocks.core import OptionError
 from ..flat import NONE, FlatDiagram
+from .chain_slopes import Slopes
 from .delay_channels import DelayChannels, find_loops, reaches
 from .derivatives import LocalDerivatives, Numbers
 from .plant_models import EQUILIBRIUM
 
 SAME_SLOPES = 1e-9
 """Difference of two derivatives, relative to 1 + the largest, up to which they are the same."""
-Pair = tuple[np.ndarray, np.ndarray]
-"""Matrices from the model's state and from the injected signals."""
 Past = dict[int, np.ndarray]
 """A quantity as a sum over ticks of the past: number of a tick to the matrix that multiplies the signals there."""
 
@@ -262,36 +261,34 @@ class DelayLine:
         """Return the matrix from the line to the outputs of the delays at the tick of a place in the period."""
         return self._read(place)[len(self.flow.A) :]
 
-    def signals(self, x_of: Pair, W: np.ndarray) -> Pair:
-        """Return the signals of a tick, from the model's state and the injected signals.
+    def signals(self, x: Slopes, W: np.ndarray) -> Slopes:
+        """Return the signals of a tick: the continuous states after it, and what is held until the next one.
 
-        They are the continuous states after the tick and what is held until the next one. ``x_of`` are all states
-        after the tick, W are the outputs of FMUs.
+        ``x`` are all states after the tick, W are the outputs of FMUs.
         """
         rest, others, injected = self.flow.held
         xc, m = self.flow.continuous, len(injected)
-        by_state = np.vstack([x_of[0][xc], x_of[0][rest], W[others], np.zeros((m, W.shape[1]))])
-        by_d = np.vstack([x_of[1][xc], x_of[1][rest], np.zeros((len(others), m)), np.eye(m)])
-        return by_state, by_d
+        by_state = np.vstack([x.by_state[xc], x.by_state[rest], W[others], np.zeros((m, W.shape[1]))])
+        by_d = np.vstack([x.by_d[xc], x.by_d[rest], np.zeros((len(others), m)), np.eye(m)])
+        return Slopes(by_state, by_d)
 
-    def flow_over(self, place: int, signals: Pair) -> Pair:
-        """Return the continuous states at the end of the flow, from the model's state and the injected signals."""
-        now = self.flow.tables[place][0].get(0, np.zeros((len(self.flow.A), self.flow.width)))
-        by_state, by_d = (now @ part for part in signals)
-        by_state[:, by_state.shape[1] - len(self) :] += self._read(place)[: len(self.flow.A)]
-        return by_state, by_d
+    def flow_over(self, place: int, signals: Slopes) -> Slopes:
+        """Return the continuous states at the end of the flow."""
+        found = self.flow.tables[place][0].get(0, np.zeros((len(self.flow.A), self.flow.width))) @ signals
+        found.by_state[:, found.by_state.shape[1] - len(self) :] += self._read(place)[: len(self.flow.A)]
+        return found
 
-    def move(self, place: int, signals: Pair) -> Pair:
-        """Return the line at the next tick, from the model's state and the injected signals."""
+    def move(self, place: int, signals: Slopes) -> Slopes:
+        """Return the line at the next tick."""
         m, size = len(self.kept), len(self)
         if self.ahead and self.length:
             new = np.vstack([self._rows_of(place + 1 + k, k + 1)[self.kept] for k in range(self.length)])
         else:
             new = np.zeros((size, self.flow.width))
             new[np.arange(min(m, size)), self.kept[: min(m, size)]] = 1.0
-        by_state, by_d = (new @ part for part in signals)
-        by_state[:, by_state.shape[1] - size :] += np.eye(size, k=m if self.ahead else -m)
-        return by_state, by_d
+        found = new @ signals
+        found.by_state[:, found.by_state.shape[1] - size :] += np.eye(size, k=m if self.ahead else -m)
+        return found
 
 
 def find_steady_slopes(

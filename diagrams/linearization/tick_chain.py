@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..frequency import FourMatrices
 from ..results import OperatingPoint
+from .chain_slopes import Slopes
 from .coupled_chain import LinearStep, coupling_at
 from .delay_channels import delay_channels
 from .delayed_flow import DelayedFlow, DelayLine, find_steady_slopes
@@ -135,76 +137,87 @@ class Chain:
 
     def go(self, k: int, following: int) -> None:
         """Go from tick ``k`` to the next one."""
-        flat, here, h = self.flat, self.here, float(self.flat.base * (following - k))
+        flat, here, place = self.flat, self.here, len(self.steps)
+        h = float(flat.base * (following - k))
         acting = flat.acting(k) - self.frozen
         tick = self.local.differentiate(acting, here.t, here.x, here.w)
-        mid_step = [path for path in self.paths if self._until[path] != k]
-        held = self._begin_steps(k, tick["z"])
-        kept = [*self._straight, *(i for path in mid_step for i in self._models[path].outputs)]
-        models = self.models
-        Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
+        on_way = [path for path in self.paths if self._until[path] != k]
+        keeping = self._begin_steps(k, tick["z"])
         line = self._begin_line(tick["x"])
-        nx, nz, n_p, nw = flat.width, flat.plant_inputs.total, len(Ap), flat.plant_outputs.total
-        n = nx + n_p + nz + (nw if self._holds else 0) + (len(line) if line else 0)
-        W = np.zeros((nw, n), dtype=np.result_type(Cp, tick["x", "x"]))  # outputs of FMUs and delays before the tick
-        W[:, nx : nx + n_p], W[:, nx + n_p : nx + n_p + nz] = Cp, Dp
-        W[kept] = 0.0
-        W[kept, [nx + n_p + nz + i for i in kept]] = 1.0
-        place = len(self.steps)
-        if line:
-            W[self._channels.outputs, n - len(line) :] = line.outputs(place)
-
-        def eliminate_w(quantity: str) -> tuple[np.ndarray, np.ndarray]:
-            by_state = tick[quantity, "w"] @ W
-            by_state[:, :nx] += tick[quantity, "x"]
-            return by_state, tick[quantity, "d"]
-
-        x_of, x_by_d = eliminate_w("x")
-        z_of, z_by_d = eliminate_w("z")
-        for path in held:  # the inputs that it has already
-            mine = self._models[path].inputs
-            z_of[mine], z_by_d[mine] = 0.0, 0.0
-            z_of[mine, [nx + n_p + i for i in mine]] = 1.0
-        x1 = tick["x"]
-        signals = line.signals((x_of, x_by_d), W) if line else None
-        begun = tuple(self._models[path] for path in self.paths if path not in mid_step)
-        self.visits.append(Visit(acting, here, h, tick, W, x1, begun))
+        state, of_plants = self._lay_out(line)
+        # At the tick: the states after it, the inputs of FMUs and the measured signals.
+        W = self._outputs_before(state, on_way, line, tick["x", "x"].dtype)
+        x, z, y = (_read(tick, name, W) for name in "xzy")
+        for path in keeping:
+            z.hold(self._models[path].inputs, state.slices["z"].start)
+        begun = tuple(self._models[path] for path in self.paths if path not in on_way)
+        self.visits.append(Visit(acting, here, h, tick, W, tick["x"], begun))
+        # From the tick to the next one: the flow of continuous blocks, with the past of transport delays.
+        signals = line.signals(x, W) if line else None
+        x_end, flow_by_w = tick["x"], np.zeros((flat.width, len(W)), dtype=W.dtype)
         if flat.continuous.size:
-            E, Ew, Ed, x1 = self._differentiate_flow(x1, h)
-            x_of, x_by_d = E @ x_of + Ew @ W, E @ x_by_d + Ed
+            E, flow_by_w, by_d, x_end = self._differentiate_flow(x_end, h)
+            x = E @ x + Slopes(flow_by_w @ W, by_d)
+        if line and signals:
+            late = line.flow_over(place, signals)
+            x.by_state[flat.continuous], x.by_d[flat.continuous] = late.by_state, late.by_d
+        # The steps of FMUs. Outputs change where a coupling says so; else they follow from the state at the next tick.
+        w = Slopes(W, np.zeros((len(W), x.by_d.shape[1]), dtype=W.dtype))
+        if self._coupled is None:
+            p = self._step_plants(z, state, of_plants, following)
         else:
-            Ew = np.zeros((nx, nw), dtype=W.dtype)
-        if line and signals:
-            x_of[flat.continuous], x_by_d[flat.continuous] = line.flow_over(place, signals)
-        P, P_by_d = Bp @ z_of, Bp @ z_by_d
-        P[:, nx : nx + n_p] += Ap
-        W_next, states = W, Layout.of({m.path: (len(m.A),) for m in models})
-        for path in self.paths:
-            if self._until[path] != following:  # it is on its way
-                rows = states.entries([path])
-                P[rows], P_by_d[rows] = 0.0, 0.0
-                P[rows, [nx + i for i in rows]] = 1.0
-        W_by_d = np.zeros((nw, x_by_d.shape[1]), dtype=W.dtype)
-        if self._coupled is not None:
-            before = np.zeros((n_p, n + x_by_d.shape[1]), dtype=P.dtype)
-            before[:, nx : nx + n_p] = np.eye(n_p)
-            x_all, z_all, w_all = (np.hstack(pair) for pair in ((x_of, x_by_d), (z_of, z_by_d), (W, W_by_d)))
+            n, p_before = state.total, np.zeros((of_plants.total, state.total + x.by_d.shape[1]), dtype=W.dtype)
+            p_before[:, state.slices["p"]] = np.eye(of_plants.total)
+            parts = (part.side_by_side for part in (x, z, w))
             end = self._end_time(following)
-            step = LinearStep(x_all, z_all, w_all, before, here.t, end, x1, here.w, tick["z"], dict(states.slices))
-            self._models |= self._coupled.go(step, lambda path, z: self._model_plant(path, z, h), Ew)
-            (x_of, x_by_d), (P, P_by_d), (z_of, z_by_d), (W_next, W_by_d) = (
-                (part[:, :n], part[:, n:]) for part in (step.x, step.p, step.z, step.w)
-            )
-        M, N = np.vstack([x_of, P, z_of]), np.vstack([x_by_d, P_by_d, z_by_d])
-        if self._holds:
-            M, N = np.vstack([M, W_next]), np.vstack([N, W_by_d])
-        if line and signals:
-            past = line.move(place, signals)
-            M, N = np.vstack([M, past[0]]), np.vstack([N, past[1]])
+            step = LinearStep(*parts, p_before, here.t, end, x_end, here.w, tick["z"], dict(of_plants.slices))
+            self._models |= self._coupled.go(step, lambda path, z: self._model_plant(path, z, h), flow_by_w)
+            x, p, z, w = (Slopes.split(part, n) for part in (step.x, step.p, step.z, step.w))
+        after = [x, p, z, *([w] if self._holds else []), *([line.move(place, signals)] if line and signals else [])]
+        whole = Slopes.stack(after)
         if not self.steps:
-            self.n_p, self._first_tick = n_p, tick
-        self.steps.append((M, N, *eliminate_w("y")))
-        self._move(following, x1, tick["z"])
+            self.n_p, self._first_tick = of_plants.total, tick
+        self.steps.append((whole.by_state, whole.by_d, y.by_state, y.by_d))
+        self._move(following, x_end, tick["z"])
+
+    def _lay_out(self, line: DelayLine | None) -> tuple[Layout, Layout]:
+        """Return the layout of the chain's state before a tick, and that of the FMUs' states in it."""
+        of_plants = Layout.of({m.path: (len(m.A),) for m in self.models})
+        sizes = {
+            "x": self.flat.width,
+            "p": of_plants.total,
+            "z": self.flat.plant_inputs.total,
+            "w": self.flat.plant_outputs.total if self._holds else 0,
+            "past": len(line) if line else 0,
+        }
+        return Layout.of({name: (size,) for name, size in sizes.items()}), of_plants
+
+    def _outputs_before(
+        self, state: Layout, on_way: Sequence[str], line: DelayLine | None, kind: np.dtype[Any]
+    ) -> np.ndarray:
+        """Return the derivatives of the outputs of FMUs and transport delays before a tick by the state.
+
+        Those of FMUs that are on their way are held.
+        """
+        C, D = (join_matrices(self.flat, self.models, which) for which in "CD")
+        W = np.zeros((len(C), state.total), dtype=np.result_type(C, kind))
+        W[:, state.slices["p"]], W[:, state.slices["z"]] = C, D
+        kept = [*self._straight, *(i for path in on_way for i in self._models[path].outputs)]
+        W[kept] = 0.0
+        W[kept, [state.slices["w"].start + i for i in kept]] = 1.0
+        if line:
+            W[self._channels.outputs, state.slices["past"]] = line.outputs(len(self.steps))
+        return W
+
+    def _step_plants(self, z: Slopes, state: Layout, of_plants: Layout, following: int) -> Slopes:
+        """Return the FMUs' states at the next tick; those of FMUs whose steps end later stay."""
+        A, B = (join_matrices(self.flat, self.models, which) for which in "AB")
+        p = B @ z
+        p.by_state[:, state.slices["p"]] += A
+        for path in self.paths:
+            if self._until[path] != following:
+                p.hold(of_plants.entries([path]), state.slices["p"].start)
+        return p
 
     def _check_delays(self) -> None:
         """Refuse transport delays next to FMUs that are coupled within a step."""
@@ -334,6 +347,13 @@ class Chain:
             if any(np.max(np.abs(a - b), initial=0.0) > same * (1 + np.max(np.abs(b), initial=0.0)) for a, b in pairs):
                 findings.append(UnusualStart())
         return findings
+
+
+def _read(tick: Numbers, name: str, W: np.ndarray) -> Slopes:
+    """Return the slopes of a result of a tick, in which the outputs of FMUs follow from the state."""
+    by_state = tick[name, "w"] @ W
+    by_state[:, : tick[name, "x"].shape[1]] += tick[name, "x"]
+    return Slopes(by_state, tick[name, "d"])
 
 
 def _plant_states(flat: FlatDiagram, point: OperatingPoint, models: Sequence[PlantModel]) -> np.ndarray:
