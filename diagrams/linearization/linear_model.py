@@ -646,7 +646,7 @@ def _linearize(
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
         _check_opening(flat, signal)
-    local = LocalDerivatives.at(flat, at, *found, stairs)
+    local = LocalDerivatives.at(flat, at, found[0], found[1], found[2], stairs)
     discrete = _is_discrete(diagram, step)
     if discrete and loop:
         _check_loop(local, at)
