@@ -24,7 +24,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, Layout, identity
 from ...fmus.calls import LoadedFmu
-from ...fmus.running import Derivation, DerivativeMethod, RestoredPoint
+from ...fmus.running import Derivation, DerivativeMethod, RestoredPoint, setup_of
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
@@ -155,7 +155,7 @@ class _Runner:
         self.inputs = {variables[port].name: np.array(v, dtype=float) for port, v in point["inputs"].items()}
         self.start = {n: v for n, v in point["state"].items() if self.about.find(n).initial == "exact"}
         self.outputs = [v.name for v in block.output_variables.values()]
-        self.instance = LoadedFmu(block)
+        self.instance = LoadedFmu(setup_of(block))
         self._steps, self._fresh = 0, True
         names = [*dict.fromkeys([*self.inputs, *self.outputs, *self.about.states])]
         self.rest = RestoredPoint(self.instance, names, self._start_at_rest)

@@ -14,8 +14,8 @@ import numpy as np
 
 from ...blocks.core import Layout, LoopwrightError, SimulationError
 from ...fmus import Fmu
-from ...fmus.calls import find_limits
 from ...fmus.platform import is_built_here
+from ...fmus.running import setup_of
 from ..flat import WiredDiagram
 from ..results import Run
 from ..simulation import RunOptions, simulate
@@ -64,14 +64,16 @@ class Plan:
         if self.options.get("start") is not None:
             return "they continue from a state, start="
         for path, plant in self._plants.items():
-            if find_limits(plant) is not None or not is_built_here(plant.description.digest):
+            if setup_of(plant).process_limits is not None or not is_built_here(plant.description.digest):
                 return f"{path} was not built by Loopwright on this machine, or runs in its own process"
         return ""
 
     @property
     def is_alone(self) -> bool:
         """Whether a process can run one sample at a time: an FMU of another tool is loaded in it."""
-        return not all(find_limits(p) is not None or is_built_here(p.description.digest) for p in self._plants.values())
+        return not all(
+            setup_of(p).process_limits is not None or is_built_here(p.description.digest) for p in self._plants.values()
+        )
 
     @property
     def _plants(self) -> dict[str, Fmu]:

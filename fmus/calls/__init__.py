@@ -2,18 +2,17 @@
 
 from .bound_calls import BoundCalls, Call
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
-from .fmu_block import FmuBlock
+from .fmu_setup import FmuSetup
 from .instance import FmuInstance
 from .library_functions import LibraryFunctions, exported_name, list_prototypes
-from .loaded_library import LoadedFmu
-from .loading import find_limits
+from .loaded_fmu import LoadedFmu
 from .model_exchange_instance import ModelExchangeInstance
 from .model_structure import is_smooth
 from .native_actions import NativeAction, NativeLook
 from .native_step import NativeStep, QuietStep, RemoteStep, SharedValues
 from .saved_state import FmuState
-from .step_failures import NEAR
 from .step_options import StepOptions, StepTime, check_offered
+from .step_outcome import NEAR
 from .transfer import is_kept
 
 __all__ = [
@@ -23,8 +22,8 @@ __all__ = [
     "BoundCalls",
     "Call",
     "FmiCalls",
-    "FmuBlock",
     "FmuInstance",
+    "FmuSetup",
     "FmuState",
     "LibraryFunctions",
     "LoadedFmu",
@@ -40,7 +39,6 @@ __all__ = [
     "StepTime",
     "check_offered",
     "exported_name",
-    "find_limits",
     "is_kept",
     "is_smooth",
     "list_prototypes",

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from ...blocks.core import FmuRuntimeError
 from .bound_calls import Call
 
 
@@ -62,3 +63,15 @@ class EventCalls:
     answers: AnswersAt
     kept: Any
     """Memory of the answers."""
+
+
+def check_next_time(label: str, found: float, t: float) -> float:
+    """Return the time of a next event in s, as an event at time t has set it; refuse one that is no number."""
+    if math.isnan(found):
+        raise FmuRuntimeError(
+            f"the event at t = {t:.9g} s sets the time of its next one (nextEventTime) to NaN; expected a time, or "
+            "nextEventTimeDefined = false. Look up its inputs and parameters there, or report it to its makers.",
+            block=label,
+            t=t,
+        )
+    return found

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError
-from ..archive import FmuVariable, OtherVariable
+from ..archive import OtherVariable
+from .event_calls import check_next_time
 from .fmi_calls import MOST_ROUNDS
-from .fmu_block import check_next_time
-from .step_failures import ROUNDED, StepFailures
-from .transfer import Transfer, WatchedInputs
+from .loaded_fmu import LoadedFmu
+from .step_outcome import ROUNDED, StepOutcome
+from .transfer import Transfer, UnfitError, WatchedInputs
 
 _CHANGED = 2
 """Qualifier of an interval that the FMU has set again (fmi3IntervalChanged)."""
@@ -63,8 +63,8 @@ class EventMemory:
 class EventMode:
     """Events of an instance: before a step, within it, and at its end. ``vector`` are all inputs, shared."""
 
-    def __init__(self, fmu: StepFailures, inputs: Mapping[str, FmuVariable], vector: np.ndarray):
-        self.fmu, self.fmi = fmu, fmu.fmi
+    def __init__(self, fmu: LoadedFmu, outcome: StepOutcome, vector: np.ndarray):
+        self.fmu, self.fmi, self.outcome, inputs = fmu, fmu.fmi, outcome, fmu.inputs
         self.discrete = [port for port, v in inputs.items() if v.variability != "continuous"]
         ours = {v.name: v for v in fmu.description.other.values() if v.type_is_clock and v.causality == "input"}
         by_clocks: dict[tuple[str, ...], list[str]] = {}
@@ -128,12 +128,12 @@ class EventMode:
         waiting = {name for names, part in self._clocked if part.differs for name in names if name in self._triggered}
         if changed or self._is_fresh or waiting or due or self.next_event <= t + ROUNDED * h:
             self._enter()
-            self.fmu.set_inputs(self._jumping.transfer, t)
+            self._set(self._jumping.transfer, t)
             if self._sampled is not None:
-                self.fmu.set_inputs(self._sampled, t)
+                self._set(self._sampled, t)
             self._activate(t, due, waiting)
             self._settle(t)
-            self.fmu.check_end(t, h, t)
+            self.outcome.check_end(t, h, t)
         self._is_fresh = False
 
     def act_within(self, t: float, end: float, h: float, *, asked: bool) -> bool:
@@ -155,6 +155,15 @@ class EventMode:
     def _enter(self) -> None:
         self.fmu.call("entering Event Mode", self.fmi.enter_event_mode)
 
+    def _set(self, inputs: Transfer, t: float) -> None:
+        """Set inputs at a time in s."""
+        self.fmu.check_limits(inputs, t)
+        try:
+            status = inputs.set()
+        except UnfitError as error:
+            raise self.fmu.refuse(error, t) from None
+        self.fmu.judge("setting the inputs", status, t)
+
     def _activate(self, t: float, due: list[InputClock], triggered: set[str]) -> None:
         """Let clocks tick, and set the inputs that may be set at these ticks alone."""
         ticking = {clock.variable.name: clock.variable for clock in due}
@@ -167,23 +176,23 @@ class EventMode:
         for names, part in self._clocked:
             if not ticking.keys().isdisjoint(names):
                 part.take()
-                self.fmu.set_inputs(part.transfer, t)
+                self._set(part.transfer, t)
 
     def _settle(self, t: float) -> None:
         """Update the discrete states until nothing changes, and go back to Step Mode."""
         fmu = self.fmu
         found = fmu.call("updating its discrete states", self.fmi.iterate_events)
         if found.terminate:  # it stays in Event Mode, in which outputs can be read
-            fmu.take_end(t, 0.0, t)
+            self.outcome.take_end(t, 0.0, t)
             return
         if found.again:
             raise FmuRuntimeError(
                 f"the events don't settle in {MOST_ROUNDS} rounds (discreteStatesNeedUpdate); expected that they end. "
                 "Report it to its makers.",
-                block=fmu.block.label,
+                block=fmu.setup.label,
                 t=t,
             )
-        self.next_event = check_next_time(fmu.block, found.next_time, t)
+        self.next_event = check_next_time(fmu.setup.label, found.next_time, t)
         self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic])
         fmu.call("entering Step Mode", self.fmi.enter_step_mode)
 

@@ -7,15 +7,17 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from .fmu_block import FmuBlock
+from ...blocks.core import FmuProcessError, FmuRuntimeError
+from .fmu_setup import FmuSetup
+from .loaded_fmu import LoadedFmu
 from .native_step import NativeStep, RemoteStep
-from .saved_state import FmuState
+from .saved_state import FmuState, SavedStates
 from .step import InstanceStep, StepMemory
-from .step_failures import StepFailures
+from .step_outcome import StepOutcome
 from .transfer import BoundStart
 
 
-class FmuInstance(StepFailures):
+class FmuInstance(LoadedFmu):
     """Loaded FMU that takes one step at a time, through vectors that are shared with the scheduler.
 
     Saving and serializing its state depend on the FMU: `can_save`, `can_serialize`.
@@ -36,17 +38,21 @@ class FmuInstance(StepFailures):
     finish_remote: Callable[[float, float], None]
     """End a step from t over h, both in s, that a loop in C has begun in another process."""
 
-    def __init__(self, block: FmuBlock, wired: Sequence[str]):
-        super().__init__(block, wired)
-        self._outputs = dict(block.output_variables)
+    def __init__(self, setup: FmuSetup, wired: Sequence[str]):
+        super().__init__(setup, wired)
+        self.states, self._outcome = SavedStates(self), StepOutcome(self)
         self._step: InstanceStep | None = None
         self.read = lambda t: None
         self._starts: dict[tuple[str, ...], BoundStart | None] = {}
 
+    @property
+    def t(self) -> float:
+        """Time of the instance in s."""
+        return self._outcome.t if self.is_running else self._began
+
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Bind the vectors of the inputs to set and of the outputs to get, and get the outputs once."""
-        self.vector = inputs
-        self._step = step = InstanceStep(self, self._outputs, inputs, outputs)
+        self._step = step = InstanceStep(self, self.states, self._outcome, inputs, outputs)
         self.step, self.start_step, self.finish_step = step.function(), step.start, step.finish
         self.judge_native, self.finish_remote = step.judge_native, step.finish_native
         self.exchange, self.read = step.exchange, step.read
@@ -62,13 +68,23 @@ class FmuInstance(StepFailures):
         """Its step in another process as C asks for it; None in this one, and where Python has to take each step."""
         return None if self._step is None else self._step.remote
 
+    def report(self, action: str, status: int, t: float) -> FmuRuntimeError:
+        """Return the error of an action that has failed with a status."""
+        return self._outcome.report(action, status, t)
+
+    def lose(self, error: FmuProcessError) -> FmuProcessError:
+        """Note that the process of the FMU has ended, in a step at its start."""
+        if self.is_running and self._outcome.is_stepping:
+            self._outcome.width.value = 0.0
+        return super().lose(error)
+
     # ---- the start ----
 
     def begin(self) -> None:
         """Leave Initialization Mode and read the outputs at the start of the run."""
         with self.host if self._start is None else nullcontext():
             super().begin()
-            self.set_span(self._began, 0.0)
+            self._outcome.set_span(self._began, 0.0)
             self.read(self._began)
             if self.record.variables:
                 self.begin_texts(self._began)
@@ -86,7 +102,7 @@ class FmuInstance(StepFailures):
         self.reset()
         if self._step is not None:
             self._step.forget()
-        given = {**self.block.start, **values}
+        given = {**self.setup.start, **values}
         if (names := tuple(given)) not in self._starts:
             fits = self.is_built_here and self.native is not None and BoundStart.fits(self.description, names)
             self._starts[names] = BoundStart(self.fmi, self.description, names) if fits else None
@@ -94,7 +110,7 @@ class FmuInstance(StepFailures):
         if start is not None:
             self._began, self._given = 0.0, given
             try:
-                entered = start.enter(given, self.block.stepping.tolerance)
+                entered = start.enter(given, self.setup.stepping.tolerance)
             except Exception as error:
                 raise self._initialization_error(error) from error
             if entered:
@@ -115,11 +131,34 @@ class FmuInstance(StepFailures):
             self._step.look_at_texts()
         super().begin_texts(t)
 
-    # ---- states ----
+    # ---- saved states ----
+
+    @property
+    def can_save(self) -> bool:
+        """Whether its state can be saved and restored."""
+        return self.description.can_save
+
+    @property
+    def can_serialize(self) -> bool:
+        """Whether a saved state can be turned into bytes."""
+        return self.description.can_serialize
 
     def save(self) -> FmuState:
-        """Save the present state with all its parts, and what its steps keep besides it; see `SavingFmu.save`."""
-        state = super().save()
+        """Save the present state with all its parts: states, inputs, parameters, memory of the solver and of its steps.
+
+        Returns
+        -------
+        FmuState
+            For `restore` and `serialize` of the same instance.
+
+        Raises
+        ------
+        FmuError
+            If the FMU can't save its state (`can_save`).
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        state = self.states.save()
         state.steps = None if self._step is None else self._step.memory()
         return state
 
@@ -133,10 +172,42 @@ class FmuInstance(StepFailures):
         FmuRuntimeError
             If the FMU's function fails.
         """
-        super().restore(state)
+        self.states.restore(state)
         self.refused = None
-        self.set_span(state.t, 0.0)
+        self._outcome.set_span(state.t, 0.0)
         if self._step is not None:
             self._step.return_to(state.t, state.steps if isinstance(state.steps, StepMemory) else None)
         self.read(state.t)
         self.begin_texts(state.t)
+
+    def serialize(self, state: FmuState | None = None) -> bytes:
+        """Return a saved state, or the present one, as bytes.
+
+        An FMU of the same content on the same platform can read them, so that a run continues in another process.
+
+        Raises
+        ------
+        FmuError
+            If the FMU can't serialize its state (`can_serialize`), or the state belongs to another instance.
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        return self.states.serialize(state)
+
+    def deserialize(self, data: bytes) -> FmuState:
+        """Return a state of this instance, made from bytes; `restore` it after `begin`.
+
+        Raises
+        ------
+        FmuError
+            If the bytes are no state of this FMU on this platform.
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        return self.states.deserialize(data)
+
+    def close(self) -> None:
+        """Free the saved states, then terminate and free the instance."""
+        if self.is_open:
+            self.states.close()
+        super().close()

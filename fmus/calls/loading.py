@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from ..isolation import Isolation, default_memory, give_back, take
-from ..platform import is_built_here
 from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FmiCalls
-from .fmu_block import FmuBlock
+from .fmu_setup import FmuSetup
 from .remote_calls import RemoteCalls
 
 _CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
@@ -20,25 +19,12 @@ _REMOTE = {version: type(f"Remote{kind.__name__}", (RemoteCalls, kind), {}) for 
 _EACH = 256  # bytes of shared memory for an element of a variable; only those that are used take memory
 
 
-def find_limits(block: FmuBlock) -> Isolation | None:
-    """Return the limits of the process in which an FMU is loaded; None for this process.
-
-    An FMU that Loopwright has not built is loaded in its own process, unless its block says otherwise.
-    """
-    given = block.isolate
-    if given is None:
-        given = not is_built_here(block.description.digest)
-    if isinstance(given, Isolation):
-        return given
-    return Isolation() if given else None
-
-
-def load_calls(block: FmuBlock, limits: Isolation | None, *, folder: Path, library: Path, **arguments: Any) -> FmiCalls:
+def load_calls(setup: FmuSetup, limits: Isolation | None, *, folder: Path, library: Path, **arguments: Any) -> FmiCalls:
     """Load the library of an FMU that is unpacked into a folder: in a process with limits, or without any in this one.
 
     Further arguments are those of `FmiCalls`.
     """
-    about = block.description
+    about = setup.description
     version = about.fmi[0]
     if limits is None:
         return _CALLS[version](folder=folder, library=library, **arguments)

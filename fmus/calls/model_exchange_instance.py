@@ -14,13 +14,13 @@ from ...blocks.core import EvaluationVectors, FmuError, FmuRuntimeError, Layout,
 from ..archive import FmuVariable, ModelExchangeInfo
 from ..host_state import HostState
 from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
-from .event_calls import EventUpdate
+from .event_calls import EventUpdate, check_next_time
 from .fmi_calls import MOST_ROUNDS
-from .fmu_block import FmuBlock, check_next_time
+from .fmu_setup import FmuSetup
+from .loaded_fmu import LoadedFmu
 from .model_exchange_calls import Evaluation, Vector, call_actions
 from .model_structure import check_structure, is_smooth
 from .native_actions import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
-from .running_fmu import RunningFmu
 from .saved_state import StateFormat
 from .transfer import Transfer, UnfitError
 
@@ -32,7 +32,7 @@ _FORMAT = StateFormat(b"lw-fmu-x", "dd", "state of an FMU in model exchange", "t
 """State in model exchange: its time and the time of the next time event, in s; all inputs go before the FMU's bytes."""
 
 
-class ModelExchangeInstance(RunningFmu):
+class ModelExchangeInstance(LoadedFmu):
     """Loaded FMU whose continuous states a solver integrates.
 
     After `begin` it is in Continuous-Time Mode. There `evaluation` sets time, states and continuous inputs and gets
@@ -43,11 +43,11 @@ class ModelExchangeInstance(RunningFmu):
     time of its next time event in s, infinite without one.
     """
 
-    def __init__(self, block: FmuBlock, wired: Sequence[str]):
-        super().__init__(block, wired, model_exchange=True)
-        assert block.model_exchange_info is not None
-        self.about: ModelExchangeInfo = block.model_exchange_info
-        self._ports = dict(block.input_variables)
+    def __init__(self, setup: FmuSetup, wired: Sequence[str]):
+        super().__init__(setup, wired, model_exchange=True)
+        assert setup.model_exchange_info is not None
+        self.about: ModelExchangeInfo = setup.model_exchange_info
+        self._ports = dict(setup.input_variables)
         self._places = Layout.of({port: v.shape for port, v in self._ports.items()}).slices
         self._smooth = {port: v for port, v in self.inputs.items() if is_smooth(v)}
         n = self.about.state_count
@@ -81,7 +81,7 @@ class ModelExchangeInstance(RunningFmu):
     @property
     def t(self) -> float:
         """Time that was set last, in s."""
-        return self._time.value if self._running else self._began
+        return self._time.value if self.is_running else self._began
 
     def _index(self, ports: Iterable[str]) -> np.ndarray:
         """Return the places of some ports among all inputs."""
@@ -110,7 +110,7 @@ class ModelExchangeInstance(RunningFmu):
         return self._evaluations[wanted]
 
     def _bind(self, wanted: Wanted, then: tuple[tuple[Call, str], ...] = (), *, all_inputs: bool = False) -> Evaluation:
-        outputs = {port: self.block.output_variables[port] for port in wanted.outputs}
+        outputs = {port: self.setup.output_variables[port] for port in wanted.outputs}
         every = wanted.indicators or bool(then) or all_inputs
         used = {port: v for port, v in self._smooth.items() if every or self._is_needed(port, wanted)}
         inputs = self._allocate(sum(v.size for v in used.values()))
@@ -143,7 +143,7 @@ class ModelExchangeInstance(RunningFmu):
 
     def _is_needed(self, port: str, wanted: Wanted) -> bool:
         """Whether outputs or rates that are wanted may depend on an input."""
-        unknown = [self.block.output_variables[name] for name in wanted.outputs]
+        unknown = [self.setup.output_variables[name] for name in wanted.outputs]
         if wanted.rates:
             unknown += [self.description.find(name) for name in self.description.states.values()]
             if not self.description.states:
@@ -154,7 +154,7 @@ class ModelExchangeInstance(RunningFmu):
         self._x[:] = x[self._order]
         try:
             with self.host if self._guarded else _NOTHING:
-                status, action = made.run(t, u, running=self._running)
+                status, action = made.run(t, u, running=self.is_running)
         except UnfitError as error:
             raise self.refuse(error, t) from None
         if status:
@@ -171,7 +171,7 @@ class ModelExchangeInstance(RunningFmu):
             return
         if status != DISCARD:
             raise self.report(actions[-1], status, t)
-        self._discarded = f"{actions[-1]} at t = {t:.9g} s{self._quote_messages().rstrip('.')}"
+        self._discarded = f"{actions[-1]} at t = {t:.9g} s{self.quote_messages().rstrip('.')}"
         into[:] = math.nan
 
     @property
@@ -188,7 +188,7 @@ class ModelExchangeInstance(RunningFmu):
         about = self.description
         if not self.about.has_derivatives or (self._x.size and not about.states):
             return None
-        outputs = [self.block.output_variables[port] for port in ports]
+        outputs = [self.setup.output_variables[port] for port in ports]
         states = [about.find_state(v) for v in outputs]
         asked = [
             v.type == "Float64" and state is None and about.has_slopes(v)
@@ -352,7 +352,7 @@ class ModelExchangeInstance(RunningFmu):
         else:
             raise self._unsettled(t)
         assert made is not None
-        self.next_time = check_next_time(self.block, made.next_time, t)
+        self.next_time = check_next_time(self.setup.label, made.next_time, t)
         x = self._get("get_states", *([] if calls.leave is None else [calls.leave]))
         if nominals:
             self.nominals = self._read_nominals()
@@ -362,8 +362,8 @@ class ModelExchangeInstance(RunningFmu):
     def _unsettled(self, t: float) -> FmuRuntimeError:
         return FmuRuntimeError(
             f"its discrete states don't settle at t = {t:.9g} s: after {MOST_ROUNDS} rounds of the event iteration it "
-            f"still asks for another one{self._quote_messages()} Report it to its makers, or change the inputs there.",
-            block=self.block.label,
+            f"still asks for another one{self.quote_messages()} Report it to its makers, or change the inputs there.",
+            block=self.setup.label,
             t=t,
         )
 
@@ -419,14 +419,14 @@ class ModelExchangeInstance(RunningFmu):
         """Go to a state that `serialize` has returned."""
         self._check_can()
         n = 8 * sum(v.size for v in self._ports.values())
-        (t, next_time), rest = _FORMAT.unpack(data, self.description.digest, self.block.label, least=n)
+        (t, next_time), rest = _FORMAT.unpack(data, self.description.digest, self.setup.label, least=n)
         u, rest = np.frombuffer(rest[:n], "<f8").copy(), rest[n:]
         handle = self.call("reading a serialized state", self.fmi.deserialize_state, rest)
         try:
             self.call("restoring its state", self.fmi.set_state, handle)
         finally:
             self.free_state(handle)
-        self.failed, self._running, self.is_final, self.ends_run = False, True, False, False
+        self.failed, self.is_running, self.is_final, self.ends_run = False, True, False, False
         self.u, self.next_time, self._time.value = u, next_time, t
 
     def _check_can(self) -> None:
@@ -436,7 +436,7 @@ class ModelExchangeInstance(RunningFmu):
         raise FmuError(
             f"its state can't be turned into bytes: {flag} is false for model exchange in the FMU's description. "
             "Export it with that capability, or run again from the start.",
-            block=self.block.label,
+            block=self.setup.label,
         )
 
     # ---- errors ----
@@ -446,10 +446,10 @@ class ModelExchangeInstance(RunningFmu):
         self.failed, self.fatal = status >= ERROR, status >= FATAL
         u = ", ".join(f"{port} = {self.u[self._places[port]].tolist()}" for port in self.inputs)
         return FmuRuntimeError(
-            f"{action} failed with {self.fmi.status_name(status)} at t = {t:.9g} s{self._quote_messages()} Its states "
+            f"{action} failed with {self.fmi.status_name(status)} at t = {t:.9g} s{self.quote_messages()} Its states "
             f"were {self._x.tolist()}, its inputs at the last step {u or 'none'}. Look at the last samples of "
             "error.run, or check its inputs and start values.",
-            block=self.block.label,
+            block=self.setup.label,
             t=t,
         )
 
@@ -512,7 +512,7 @@ class ModelExchangeInstance(RunningFmu):
     def judge_native(self, action: str, status: int, t: float) -> None:
         """Raise the error of a call of C that has failed; without a status, of an event that has no end or no time."""
         if not status:
-            check_next_time(self.block, self._events.answers.updated().next_time, t)
+            check_next_time(self.setup.label, self._events.answers.updated().next_time, t)
             raise self._unsettled(t)
         if status != DISCARD:
             raise self.report(action, status, t)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...blocks.core import FmuRuntimeError, Wanted, elements
 from ..archive import FmuVariable, ModelExchangeInfo
-from .running_fmu import RunningFmu
+from .loaded_fmu import LoadedFmu
 
 _MOVED, _SAME = 1e-4, 1e-8
 """Relative distance by which states and inputs are moved, and change of a value that is none."""
@@ -26,7 +26,7 @@ def is_smooth(variable: FmuVariable) -> bool:
 
 
 def check_structure(
-    fmu: RunningFmu,
+    fmu: LoadedFmu,
     exchange: ModelExchangeInfo,
     places: Mapping[str, slice],
     evaluation: Callable[[Wanted], Callable[[float, np.ndarray, np.ndarray], np.ndarray]],
@@ -51,10 +51,10 @@ def check_structure(
         for text in _CHECKED[key]:
             fmu.add_note(text)
         return
-    if fmu.is_built_here or fmu.block.dependencies == "all" or (x.size and not about.states):
+    if fmu.is_built_here or fmu.setup.dependencies == "all" or (x.size and not about.states):
         return
-    ports = [p for p, v in fmu.block.output_variables.items() if v.type == "Float64" and is_smooth(v)]
-    rows = [fmu.block.output_variables[p] for p in ports]
+    ports = [p for p, v in fmu.setup.output_variables.items() if v.type == "Float64" and is_smooth(v)]
+    rows = [fmu.setup.output_variables[p] for p in ports]
     rows += [about.find(name) for name in about.states.values()]
     columns: list[tuple[FmuVariable, str | None]] = [(about.find(name), None) for name in about.states]
     columns += [(fmu.inputs[port], port) for port in smooth]
@@ -102,7 +102,7 @@ def check_structure(
             f"{max(sizes):.3g} where that moves by {step[k]:.3g}. The order of evaluation would be wrong. Take "
             "interface='co_simulation' if it is offered, or dependencies='all', by which everything may depend on "
             "everything, and report it to its makers.",
-            block=fmu.block.label,
+            block=fmu.setup.label,
             t=t,
         )
     values(start)

@@ -4,145 +4,102 @@ from __future__ import annotations
 
 import struct
 import weakref
-from collections.abc import Sequence
 from typing import Any
 
 from ...blocks.core import FmuError, explain_calls
 from ..platform import native_platform
-from .fmu_block import FmuBlock
-from .running_fmu import RunningFmu
+from .loaded_fmu import LoadedFmu
 
 
-class SavingFmu(RunningFmu):
-    """Instance whose states can be saved and restored, where the FMU offers that: `can_save`, `can_serialize`."""
+class SavedStates:
+    """States of an instance that are saved, restored, and turned into bytes, where the FMU offers that.
 
-    def __init__(self, block: FmuBlock, wired: Sequence[str]):
-        super().__init__(block, wired)
-        self._handles: dict[int, Any] = {}
-        self.final = self.fmi.final  # noSetFMUStatePriorToCurrentPoint, until a state has been saved
+    Attributes
+    ----------
+    handles : dict
+        The FMU's handles of those that are not freed yet.
+    final : ctypes value
+        Argument noSetFMUStatePriorToCurrentPoint of a step: true until a state has been saved.
+    """
 
-    @property
-    def can_save(self) -> bool:
-        """Whether its state can be saved and restored."""
-        return self.description.can_save
-
-    @property
-    def can_serialize(self) -> bool:
-        """Whether a saved state can be turned into bytes."""
-        return self.description.can_serialize
+    def __init__(self, fmu: LoadedFmu):
+        self._fmu, self.handles = fmu, dict[int, Any]()
+        self.final = fmu.fmi.final
 
     def save(self) -> FmuState:
-        """Save the present state with all its parts: states, inputs, parameters, memory of the solver.
-
-        Returns
-        -------
-        FmuState
-            For `restore` and `serialize` of the same instance.
-
-        Raises
-        ------
-        FmuError
-            If the FMU can't save its state (`can_save`).
-        FmuRuntimeError
-            If the FMU's function fails.
-        """
-        self._check_can(self.description.state_flags[0], "saved", self.can_save)
-        return self.keep(self.call("saving its state", self.fmi.save_state))
-
-    def restore(self, state: FmuState) -> None:
-        """Restore a saved state, earlier or later; this is allowed after an error, too.
-
-        Raises
-        ------
-        FmuError
-            If the state belongs to another instance, or has been freed.
-        FmuRuntimeError
-            If the FMU's function fails.
-        """
-        self._check_state(state)
-        self.go_back(state)
-        self.failed, self._running = False, state.running
-
-    def go_back(self, state: FmuState) -> None:
-        """Set the FMU back to its own state, and nothing else."""
-        self.call("restoring its state", self.fmi.set_state, state.handle)
-
-    def serialize(self, state: FmuState | None = None) -> bytes:
-        """Return a saved state, or the present one, as bytes.
-
-        An FMU of the same content on the same platform can read them, so that a run continues in another process.
-
-        Raises
-        ------
-        FmuError
-            If the FMU can't serialize its state (`can_serialize`), or the state belongs to another instance.
-        FmuRuntimeError
-            If the FMU's function fails.
-        """
-        self._check_can(self.description.state_flags[1], "turned into bytes", self.can_serialize)
-        if state is None:
-            state = self.save()
-        self._check_state(state)
-        data = self.call("serializing its state", self.fmi.serialize_state, state.handle)
-        return _FORMAT.pack(self.description.digest, state.t, state.running, data=bytes(data))
-
-    def deserialize(self, data: bytes) -> FmuState:
-        """Return a state of this instance, made from bytes; `restore` it after `begin`.
-
-        Raises
-        ------
-        FmuError
-            If the bytes are no state of this FMU on this platform.
-        FmuRuntimeError
-            If the FMU's function fails.
-        """
-        self._check_can(self.description.state_flags[1], "made from bytes", self.can_serialize)
-        (t, running), rest = _FORMAT.unpack(data, self.description.digest, self.block.label)
-        state = self.keep(self.call("reading a serialized state", self.fmi.deserialize_state, rest))
-        state.t, state.running = t, running
-        return state
+        """Save the present state."""
+        about = self._fmu.description
+        self._check_can(about.state_flags[0], "saved", about.can_save)
+        return self.keep(self._fmu.call("saving its state", self._fmu.fmi.save_state))
 
     def keep(self, handle: Any) -> FmuState:
         """Return the saved state of a handle, as one of the present time."""
         self.final.value = False  # the FMU may be set back from now on
-        self._handles[id(handle)] = handle
-        return FmuState(self, handle, self.t, self._running)
+        self.handles[id(handle)] = handle
+        return FmuState(self, self._fmu.setup.label, handle, self._fmu.t, self._fmu.is_running)
+
+    def go_back(self, state: FmuState) -> None:
+        """Set the FMU back to its own state, and nothing else."""
+        self._fmu.ends_run = False
+        self._fmu.call("restoring its state", self._fmu.fmi.set_state, state.handle)
+
+    def restore(self, state: FmuState) -> None:
+        """Restore a saved state, earlier or later; this is allowed after an error, too."""
+        self._check_state(state)
+        self.go_back(state)
+        self._fmu.failed, self._fmu.is_running = False, state.running
+
+    def serialize(self, state: FmuState | None) -> bytes:
+        """Return a saved state, or the present one, as bytes."""
+        about = self._fmu.description
+        self._check_can(about.state_flags[1], "turned into bytes", about.can_serialize)
+        if state is None:
+            state = self.save()
+        self._check_state(state)
+        data = self._fmu.call("serializing its state", self._fmu.fmi.serialize_state, state.handle)
+        return _FORMAT.pack(about.digest, state.t, state.running, data=bytes(data))
+
+    def deserialize(self, data: bytes) -> FmuState:
+        """Return a state of this instance, made from bytes."""
+        about = self._fmu.description
+        self._check_can(about.state_flags[1], "made from bytes", about.can_serialize)
+        (t, running), rest = _FORMAT.unpack(data, about.digest, self._fmu.setup.label)
+        state = self.keep(self._fmu.call("reading a serialized state", self._fmu.fmi.deserialize_state, rest))
+        state.t, state.running = t, running
+        return state
 
     def release(self, handle: Any) -> None:
         """Free the saved state of a handle, once."""
-        if self._handles.pop(id(handle), None) is not None:
-            self.free_state(handle)
+        if self.handles.pop(id(handle), None) is not None:
+            self._fmu.free_state(handle)
+
+    def close(self) -> None:
+        """Free all that are left."""
+        for handle in [*self.handles.values()]:
+            self.release(handle)
 
     def _check_can(self, flag: str, action: str, can: bool) -> None:
-        if not self._open:
-            text = f"its run is over, so no state can be {action}. Do it within the run."
-            raise FmuError(text, block=self.block.label)
+        label = self._fmu.setup.label
+        if not self._fmu.is_open:
+            raise FmuError(f"its run is over, so no state can be {action}. Do it within the run.", block=label)
         if not can:
             raise FmuError(
                 f"its state can't be {action}: {flag} is false in the FMU's description. Export it with that "
                 "capability, or run again from the start.",
-                block=self.block.label,
+                block=label,
             )
 
     def _check_state(self, state: FmuState) -> None:
-        self._check_can(self.description.state_flags[0], "restored", self.can_save)
-        if state.instance is not self:
+        about, label = self._fmu.description, self._fmu.setup.label
+        self._check_can(about.state_flags[0], "restored", about.can_save)
+        if state.owner is not self:
             raise FmuError(
                 f"found a state of another instance, {state!r}. Carry it over: restore(deserialize(data)) with the "
                 "data of that instance's serialize().",
-                block=self.block.label,
+                block=label,
             )
         if state.is_free:
-            raise FmuError(
-                f"found a state that has been freed, {state!r}. Keep it until it is restored.", block=self.block.label
-            )
-
-    def close(self) -> None:
-        """Free the saved states, then terminate and free the instance."""
-        if self._open:
-            for handle in list(self._handles.values()):
-                self.release(handle)
-        super().close()
+            raise FmuError(f"found a state that has been freed, {state!r}. Keep it until it is restored.", block=label)
 
 
 @explain_calls
@@ -152,11 +109,11 @@ class FmuState:
     It belongs to the instance that made it, and is freed with it, or when nothing refers to it any more.
     """
 
-    def __init__(self, instance: SavingFmu, handle: Any, t: float, running: bool):
-        self.instance, self.t, self.running = instance, t, running
+    def __init__(self, owner: SavedStates, label: str, handle: Any, t: float, running: bool):
+        self.owner, self.label, self.t, self.running = owner, label, t, running
         self.steps: object = None  # what `Step.memory` has returned
         self.handle = handle
-        self._free = weakref.finalize(self, instance.release, handle)
+        self._free = weakref.finalize(self, owner.release, handle)
         self._free.atexit = False  # the end of the process frees the memory anyway
 
     @property
@@ -169,7 +126,7 @@ class FmuState:
         self._free()
 
     def __repr__(self) -> str:
-        return f"FmuState({self.instance.block.label}, t={self.t:.9g}{', freed' if self.is_free else ''})"
+        return f"FmuState({self.label}, t={self.t:.9g}{', freed' if self.is_free else ''})"
 
 
 class StateFormat:

@@ -9,21 +9,21 @@ from __future__ import annotations
 import ctypes
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError, Layout
-from ..archive import FmuVariable
 from .bound_calls import BoundCalls, Call
 from .event_mode import EventMemory, EventMode
 from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING
+from .loaded_fmu import LoadedFmu
 from .native_step import NativeStep, QuietStep, RemoteStep, address_of, share, transfer_at
-from .saved_state import FmuState
-from .step_failures import NEAR, ROUNDED, StepFailures
+from .saved_state import FmuState, SavedStates
 from .step_options import StepParts, parts_of_step
+from .step_outcome import NEAR, ROUNDED, StepOutcome
 from .text_values import watch_texts
 from .transfer import Transfer, UnfitError, WatchedInputs
 
@@ -53,15 +53,17 @@ class InstanceStep:
     them, and those that read the outputs, in one round trip.
     """
 
-    def __init__(self, fmu: StepFailures, outputs: Mapping[str, FmuVariable], u: np.ndarray, y: np.ndarray):
-        self.fmu, self.fmi, fmi, inputs = fmu, fmu.fmi, fmu.fmi, fmu.inputs
-        self.options, self._texts = fmu.block.stepping, fmu.record
+    def __init__(self, fmu: LoadedFmu, states: SavedStates, outcome: StepOutcome, u: np.ndarray, y: np.ndarray):
+        self.fmu, self.states, self.outcome = fmu, states, outcome
+        self.fmi, fmi, inputs = fmu.fmi, fmu.fmi, fmu.inputs
+        self.options, self._texts, outcome.vector = fmu.setup.stepping, fmu.record, u
         self.parts = parts_of_step(fmu.description, self.options)
-        self.call = fmi.step_call(fmu.now, fmu.width, fmu.final)
+        self.call = fmi.step_call(outcome.now, outcome.width, states.final)
         self._guard = fmu.host if fmi.in_process and not fmu.is_built_here else nullcontext()
         self._t, self._h = 0.0, 0.0
-        self._all_inputs, self._outs = Transfer(fmi, "Set", inputs, u), Transfer(fmi, "Get", outputs, y)
-        self.events = EventMode(fmu, inputs, u) if StepParts.EVENTS in self.parts else None
+        self._all_inputs = Transfer(fmi, "Set", inputs, u)
+        self._outs = Transfer(fmi, "Get", fmu.setup.output_variables, y)
+        self.events = EventMode(fmu, outcome, u) if StepParts.EVENTS in self.parts else None
         discrete = [] if self.events is None else self.events.discrete
         held = [port for port in inputs if port not in discrete]
         self._ins = Transfer(fmi, "Set", inputs, u, held) if discrete else self._all_inputs
@@ -96,7 +98,7 @@ class InstanceStep:
         if self._slopes is not None:
             stages.append(("telling the slopes of its inputs", self._slopes.calls))
         if StepParts.ROLLBACK in self.parts:
-            self.fmu.final.value = False
+            self.states.final.value = False
             stages.append(("saving its state", [fmi.save_call(self._handle)]))
         self._place = sum(len(calls) for _, calls in stages)
         """Place of the step among the calls."""
@@ -109,11 +111,11 @@ class InstanceStep:
 
     def function(self) -> Callable[[float, float], None]:
         """Return `step`; for plain steps of whole vectors of Float64 a function that looks up little."""
-        fmu, call, run = self.fmu, self.call, self._calls.run
+        call, run, outcome = self.call, self._calls.run, self.outcome
         is_plain = self._ins.is_whole and self._outs.is_whole and not self._ins.has_limits
         if not is_plain or self.parts or self._texts.variables or not isinstance(self._guard, nullcontext):
             return self.step
-        now, width, any_flag, reached = fmu.now, fmu.width, call.any_flag, call.reached
+        now, width, any_flag, reached = outcome.now, outcome.width, call.any_flag, call.reached
         filled, spread = self._ins.views, self._outs.views  # (from, to) each, in the sense of setting
         read = self._reads.run if self.fmi.in_process else None
 
@@ -121,13 +123,13 @@ class InstanceStep:
             for here, there in filled:
                 there[:] = here
             now.value, width.value = t, h
-            fmu.is_stepping = True
+            outcome.is_stepping = True
             status = run()
             if status or any_flag.value or abs(reached.value - t - h) > h * NEAR:
                 self._t, self._h = t, h
                 self._end(status)
                 return
-            fmu.is_stepping = False
+            outcome.is_stepping = False
             if read is not None and (status := read()):
                 self._judge_reading(self._reads, status, t if status > WARNING else t + h)
             for here, there in spread:
@@ -158,8 +160,8 @@ class InstanceStep:
             self._kept.free()
             self._kept, self._handle.value = None, None
         parted = self.parts & _BY_PYTHON  # parts of a step end where others begin
-        self.fmu.set_span(t, self._next_stop(t, t + h) - t if parted else h)
-        self.fmu.is_stepping = True
+        self.outcome.set_span(t, self._next_stop(t, t + h) - t if parted else h)
+        self.outcome.is_stepping = True
         self._calls.start()
 
     def finish(self) -> None:
@@ -169,17 +171,17 @@ class InstanceStep:
 
     def finish_native(self, t: float, h: float) -> None:
         """End a step from t over h, both in s, that C has begun in another process, and get the outputs."""
-        self._t, self._h = self.fmu.now.value if StepParts.ADDED_TIME in self.parts else t, h
-        self.fmu.is_stepping = True
+        self._t, self._h = self.outcome.now.value if StepParts.ADDED_TIME in self.parts else t, h
+        self.outcome.is_stepping = True
         self.finish()
 
     def _end(self, status: int) -> None:
         """Continue to the end of a step whose calls have returned a status, and get the outputs."""
-        fmu, t, h = self.fmu, self._t, self._h
+        fmu, outcome, t, h = self.fmu, self.outcome, self._t, self._h
         self._continue_step(self._judge_calls(status), t, h)
-        fmu.set_span(t, h)
+        outcome.set_span(t, h)
         if self._slopes is not None and (status := self._slopes.take_status()) > WARNING:
-            raise fmu.report(f"setting its inputs within the step by {h:g} s", status, t)
+            raise outcome.report(f"setting its inputs within the step by {h:g} s", status, t)
         if not self._is_read and (status := self._reads.run()):
             self._judge_reading(self._reads, status, t if status > WARNING else t + h)
         self._spread(t + h)
@@ -187,7 +189,7 @@ class InstanceStep:
             fmu.note_texts(t + h)
             if self._watch is not None:
                 self._watch.take()
-        fmu.is_stepping = False
+        outcome.is_stepping = False
         if self.parts & _BY_PYTHON:
             self._taken[:] = np.concatenate([np.zeros(0), *(part.values for part in self._watched)])
             ahead = math.inf if self.events is None else self.events.next_instant
@@ -195,7 +197,7 @@ class InstanceStep:
 
     def _judge_calls(self, status: int) -> int:
         """Note warnings of the calls of a step, or raise the error of one before it; return the status of the step."""
-        fmu, t, found = self.fmu, self._t, 0
+        fmu, outcome, t, found = self.fmu, self.outcome, self._t, 0
         self._is_read = not self.fmi.in_process
         if not status or status == WARNING:
             for place in self._calls.warned_places() if status else ():
@@ -206,16 +208,16 @@ class InstanceStep:
         else:
             place = self._calls.failed
             if place < self._place:
-                raise fmu.report(self._actions[place], status, t)
+                raise outcome.report(self._actions[place], status, t)
             found = status if place == self._place else 0
             self._is_read = False  # what has failed behind the step is read once more, where its end is judged
         if StepParts.ROLLBACK in self.parts:
-            self._kept = self._before = self._kept or fmu.keep(self._handle)
+            self._kept = self._before = self._kept or self.states.keep(self._handle)
         return found
 
     def _continue_step(self, status: int, t: float, h: float) -> None:
         """Continue from the first part of a step from t over h, in parts where events are or the FMU stops early."""
-        fmu, end, now, part = self.fmu, t + h, t, self.fmu.width.value
+        outcome, end, now, part = self.outcome, t + h, t, self.outcome.width.value
         if not self.parts & (StepParts.EVENTS | StepParts.EARLY_RETURN):
             self._judge_part(status, t, h)
             return
@@ -240,18 +242,18 @@ class InstanceStep:
             stop = self._next_stop(now, end)
             part, self._is_read = stop - now, False
             if StepParts.ROLLBACK in self.parts:
-                self._before = fmu.save()
-            fmu.set_span(now, part)
+                self._before = self.states.save()
+            outcome.set_span(now, part)
             status = self.call.function(*self.call.arguments)
 
     def _is_ended(self, t: float, h: float, now: float) -> bool:
         """Return whether the FMU asks to end the simulation now; raise its error before the end of the step."""
-        self.fmu.check_end(t, h, now)
+        self.outcome.check_end(t, h, now)
         return self.fmu.ends_run
 
     def _judge_part(self, status: int, t: float, h: float) -> tuple[float, bool]:
         """Judge a step from t over h; return the time that it has reached, and whether the FMU asks for Event Mode."""
-        fmu, call = self.fmu, self.call
+        fmu, outcome, call = self.fmu, self.outcome, self.call
         if status > WARNING:
             self._is_read = False
             self._judge_failure(status, t, h)
@@ -261,20 +263,20 @@ class InstanceStep:
         event, ends, early, _ = call.flags
         if early and not ends and StepParts.EARLY_RETURN in self.parts:
             return min(max(call.reached.value, t), t + h), bool(event)
-        fmu.check_flags(call, t, h)
+        outcome.check_flags(call, t, h)
         return t + h, bool(event)
 
     def _judge_failure(self, status: int, t: float, h: float) -> None:
         """Wait for a step that is pending; take one that is discarded again, in parts; raise the error of a failure."""
-        fmu = self.fmu
+        fmu, outcome = self.fmu, self.outcome
         status, ends = self.fmi.end_step(status)
         if ends:
             reached = self.fmi.time_after_discard(t, h)
-            fmu.take_end(t, h, t if reached is None else reached)
+            outcome.take_end(t, h, t if reached is None else reached)
         elif status == WARNING:
             fmu.judge("a step", status, t)
         elif status > WARNING and not (status == DISCARD and self._take_again(t, h)):
-            raise fmu.step_error(status, t, h)
+            raise outcome.step_error(status, t, h)
 
     def _take_again(self, t: float, h: float) -> bool:
         """Take a step from t over h that was discarded again, in smaller ones; return whether that has worked.
@@ -282,7 +284,7 @@ class InstanceStep:
         With a state before it the FMU goes back to that. Else it is where it was before, in FMI 3.0 (4.2.1), or where
         its lastSuccessfulTime says, in FMI 2.0 (4.2.2); where it says nothing, the step is not taken again.
         """
-        fmu, fmi, call, state = self.fmu, self.fmi, self.call, self._before
+        fmu, fmi, outcome, call, state = self.fmu, self.fmi, self.outcome, self.call, self._before
         if not self.options.retries or (state is None and not fmu.description.variable_step):
             return False
         end, now, part, count, status = t + h, t, h, 0, DISCARD
@@ -291,7 +293,7 @@ class InstanceStep:
             if status == DISCARD:
                 known = fmi.time_after_discard(now, part)
                 if state is not None:
-                    fmu.go_back(state)
+                    self.states.go_back(state)
                     part = known - now if known is not None and smallest < known - now < part else 0.5 * part
                     if part < smallest * (1.0 - ROUNDED):
                         return False
@@ -305,9 +307,9 @@ class InstanceStep:
             if end - now <= ROUNDED * smallest:
                 break
             if status != DISCARD and state is not None:
-                state, part = fmu.save(), end - now
+                state, part = self.states.save(), end - now
             part = min(part, end - now)
-            fmu.set_span(now, part)
+            outcome.set_span(now, part)
             status, ends = fmi.end_step(call.function(*call.arguments))
             if ends or (status > WARNING and status != DISCARD):
                 self._judge_failure(status, now, part)
@@ -315,11 +317,11 @@ class InstanceStep:
             elif status <= WARNING:
                 fmu.judge("a step", status, now)
                 if call.any_flag.value:
-                    fmu.check_flags(call, now, part)
+                    outcome.check_flags(call, now, part)
             if status <= WARNING:
-                fmu.check_end(t, h, now + part)
-        fmu.set_span(t, h)
-        fmu.note_retry(t, h, count)
+                outcome.check_end(t, h, now + part)
+        outcome.set_span(t, h)
+        outcome.note_retry(t, h, count)
         return True
 
     def judge_native(self, stage: int, status: int, t: float, h: float) -> None:
@@ -332,7 +334,7 @@ class InstanceStep:
             self.step(t, h)
             return
         if stage != 1 and status > WARNING:
-            raise self.fmu.report("setting the inputs" if stage == 0 else "reading the outputs", status, t)
+            raise self.outcome.report("setting the inputs" if stage == 0 else "reading the outputs", status, t)
         self._judge_part(status if stage == 1 else 0, t, h)
 
     # ---- values ----
@@ -390,7 +392,7 @@ class InstanceStep:
                     f"its clock {clock.variable.name} ticks at {clock.next:.9g} s, between two communication points, "
                     "and it takes steps of one length only (canHandleVariableCommunicationStepSize is false); expected "
                     f"steps that end there. Run with step={clock.interval:.9g}.",
-                    block=self.fmu.block.label,
+                    block=self.fmu.setup.label,
                     t=now,
                 )
 
@@ -401,7 +403,7 @@ class InstanceStep:
         raise FmuRuntimeError(
             f"its steps returned early at {reached:.9g} s {count} times in a row; expected that it continues. "
             "Report it to its makers, or leave early_return out of stepping=.",
-            block=self.fmu.block.label,
+            block=self.fmu.setup.label,
             t=self._t,
         )
 
@@ -422,7 +424,7 @@ class InstanceStep:
             raise FmuRuntimeError(
                 f"{found} of {h:g} s, so the run would not advance; expected events that leave it its way. {advice}, "
                 "or report it to its makers.",
-                block=self.fmu.block.label,
+                block=self.fmu.setup.label,
                 t=now,
             )
         self._has_warned = True
@@ -473,7 +475,8 @@ class InstanceStep:
     @property
     def native(self) -> NativeStep | None:
         """The step as addresses; None in another process, and where it is more than three calls."""
-        fmu, is_plain = self.fmu, self._ins.is_plain and self._outs.is_plain and not self._ins.has_limits
+        fmu, outcome = self.fmu, self.outcome
+        is_plain = self._ins.is_plain and self._outs.is_plain and not self._ins.has_limits
         if not self.fmi.in_process or not is_plain or self.parts or self._texts.variables:
             return None
         at, call = ctypes.addressof, self.call
@@ -483,12 +486,12 @@ class InstanceStep:
             step=address_of(call.function),
             inputs=transfer_at(self._ins),
             outputs=transfer_at(self._outs),
-            now=at(fmu.now),
-            width=at(fmu.width),
-            final=at(fmu.final),
+            now=at(outcome.now),
+            width=at(outcome.width),
+            final=at(self.states.final),
             flags=at(call.flags),
             reached=at(call.reached),
-            kept=(fmu.now, fmu.width, fmu.final, call, self._ins, self._outs),
+            kept=(outcome.now, outcome.width, self.states.final, call, self._ins, self._outs),
             host=None if fmu.is_built_here else fmu.host,
         )
 
@@ -516,16 +519,16 @@ class InstanceStep:
                 changed=0 if self._watch is None else ctypes.addressof(self._watch.changed),
                 added=self._added if StepParts.ADDED_TIME in self.parts else None,
             )
-        at, fmu = ctypes.addressof, self.fmu
+        at, outcome = ctypes.addressof, self.outcome
         return RemoteStep(
             request=request,
             inputs=given,
             outputs=share(self._outs, checked=False) or [],
-            now=at(fmu.now),
-            width=at(fmu.width),
+            now=at(outcome.now),
+            width=at(outcome.width),
             flags=at(call.flags),
             reached=at(call.reached),
-            kept=(fmu.now, fmu.width, call, self._ins, self._outs),
+            kept=(outcome.now, outcome.width, call, self._ins, self._outs),
             quiet=quiet,
             is_careful=by_python,
         )
@@ -539,7 +542,7 @@ class InputSlopes:
     slopes.
     """
 
-    def __init__(self, fmu: StepFailures, ports: Sequence[str], u: np.ndarray):
+    def __init__(self, fmu: LoadedFmu, ports: Sequence[str], u: np.ndarray):
         fmi, is_new = fmu.fmi, fmu.description.fmi.startswith("3")
         places = Layout.of({port: v.shape for port, v in fmu.inputs.items()}).slices
         variables = {port: fmu.inputs[port] for port in ports}

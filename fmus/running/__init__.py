@@ -1,10 +1,10 @@
 """The block `Fmu` and its linear model."""
 
 from .derivation import Derivation, DerivativeMethod
-from .fmu import Fmu
+from .exchange_slopes import check_exchange_slopes, find_exchange_slopes
+from .fmu import Fmu, setup_of
 from .fmu_point import FmuLinearization
 from .known_models import linearize_fmu, step_gap
-from .linearization import check_exchange_slopes, find_exchange_slopes
 from .replacement import suggest_names
 from .restored_point import RestoredPoint
 from .shifted_steps import take_shifted_steps
@@ -18,6 +18,7 @@ __all__ = [
     "check_exchange_slopes",
     "find_exchange_slopes",
     "linearize_fmu",
+    "setup_of",
     "step_gap",
     "suggest_names",
     "take_shifted_steps",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, explain_calls, near
-from ..calls import FmuBlock, LoadedFmu, is_kept
+from ..calls import FmuSetup, LoadedFmu, is_kept
 from .derivation import Derivation
 from .fmu_start_values import check_state, check_value
 
@@ -66,28 +66,28 @@ class FmuLinearization:
 class FmuPoint:
     """An operating point, as values of the FMU's variables."""
 
-    def __init__(self, block: FmuBlock, t: float, state: Any, inputs: Any):
-        self.block, self.about, self.t = block, block.description, float(t)
+    def __init__(self, setup: FmuSetup, t: float, state: Any, inputs: Any):
+        self.setup, self.about, self.t = setup, setup.description, float(t)
         about = self.about
         self.states = list(about.states)
-        self.port_of = {v.name: port for port, v in {**block.input_variables, **block.output_variables}.items()}
+        self.port_of = {v.name: port for port, v in {**setup.input_variables, **setup.output_variables}.items()}
         self.inputs, self.outputs = (
-            [v.name for v in chosen.values()] for chosen in (block.input_variables, block.output_variables)
+            [v.name for v in chosen.values()] for chosen in (setup.input_variables, setup.output_variables)
         )
         self.moved = [n for n in self.inputs if not about.find(n).is_integer]
         self.sets_parameters = any(about.find(n).causality == "parameter" for n in self.inputs)
         if not np.isfinite(self.t):
-            raise ParameterError(f"found {t!r}; expected a time in s.", block=block.label, port="t")
+            raise ParameterError(f"found {t!r}; expected a time in s.", block=setup.label, port="t")
         ports = {self.port_of[name]: name for name in self.inputs}
         given_state = self._match_names(
-            state, {name: name for name in self.states}, "state", block.description.discrete_states
+            state, {name: name for name in self.states}, "state", setup.description.discrete_states
         )
         given_inputs = self._match_names(inputs, ports, "inputs", ())
         # model exchange sets states that have no start value of their own, as those that other tools compute
         self.given = {
-            n: check_state(about.find(n), v, block.label)
+            n: check_state(about.find(n), v, setup.label)
             if n in about.states and about.find(n).start is None
-            else check_value(about, n, v, block.label)
+            else check_value(about, n, v, setup.label)
             for n, v in {**given_state, **given_inputs}.items()
         }
 
@@ -98,14 +98,14 @@ class FmuPoint:
             known = {**names, **{name: name for name in more}}
             for name in given:
                 if name not in known:
-                    raise UnknownNameError(f"found {name!r}. {near(name, known)}", block=self.block.label, port=port)
+                    raise UnknownNameError(f"found {name!r}. {near(name, known)}", block=self.setup.label, port=port)
             return {known[name]: value for name, value in given.items()}
         vector, variables = np.ravel(np.asarray(given, dtype=float)), [self.about.find(n) for n in names.values()]
         sizes = [v.size for v in variables]
         if vector.size != sum(sizes):
             raise ParameterError(
                 f"found {vector.size} numbers; expected {sum(sizes)}, the elements of {', '.join(names) or 'nothing'}.",
-                block=self.block.label,
+                block=self.setup.label,
                 port=port,
             )
         return Layout.of({v.name: v.shape for v in variables}).split(vector)
@@ -127,7 +127,7 @@ class FmuPoint:
                 f"its state was set to {self.given[name].tolist()}, but is {np.ravel(part).tolist()} when the FMU "
                 f"has initialized at t = {self.t:.9g} s: an event there changes it, or its start value is only a "
                 f"guess. {self._next_step(exchange)}",
-                block=self.block.label,
+                block=self.setup.label,
                 port=name,
             )
 
@@ -178,7 +178,7 @@ class FmuPoint:
 @contextmanager
 def initialize_at(point: FmuPoint, exchange: bool) -> Iterator[LoadedFmu]:
     """Load the FMU and enter Initialization Mode at the operating point."""
-    instance = LoadedFmu(point.block, model_exchange=exchange)
+    instance = LoadedFmu(point.setup, model_exchange=exchange)
     try:
         instance.initialize(None, start_time=point.t, values=_exact(point, {}))
         yield instance
@@ -198,7 +198,7 @@ def step_from(point: FmuPoint, instance: LoadedFmu, h: float, moved: Mapping[str
     instance.call("setting its inputs", instance.set_values, {n: moved[n] for n in point.inputs if n in moved})
     before = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
     if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, True):
-        raise FmuError(f"it ends its step early, so {lost}.", block=point.block.label)
+        raise FmuError(f"it ends its step early, so {lost}.", block=point.setup.label)
     return before
 
 

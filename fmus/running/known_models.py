@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ...blocks.core import identity
-from .fmu import Fmu
+from .fmu import Fmu, setup_of
 from .fmu_point import FmuLinearization
 from .linearization import find_step_gap
 
@@ -42,7 +42,7 @@ def step_gap(
 ) -> tuple[float, float]:
     """Return how far a step of an FMU is from a linear model of it, and the error of that; see `find_step_gap`."""
     key = identity(block), t, identity(state), identity(inputs), h, A.tobytes(), B.tobytes()
-    return _recall(_GAPS, key, lambda: find_step_gap(block, h, t, state, inputs, A, B))
+    return _recall(_GAPS, key, lambda: find_step_gap(setup_of(block), h, t, state, inputs, A, B))
 
 
 def linearize_fmu(

@@ -1,27 +1,24 @@
 """Linear models of an FMU at an operating point: of its equations, and of a communication step.
 
 The equations are those of co-simulation at its start, or of model exchange; their derivatives are the FMU's own, held
-against differences, or differences. In a run of model exchange the derivatives are those at the instance's point
-(`find_exchange_slopes`, `check_exchange_slopes`). A communication step has differences alone.
+against differences, or differences. A communication step has differences alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError, Layout, ParameterError, accepts, kinds
+from ...blocks.core import FmuError, ParameterError, accepts, kinds
 from ...blocks.tracing import extrapolate
-from ..archive import FmuVariable
-from ..calls import FmuBlock, LoadedFmu, is_smooth
+from ..calls import FmuSetup, LoadedFmu
 from .derivation import Derivation, DerivativeMethod
 from .difference_quotients import Column, Differences, differentiate
 from .fmu_point import FmuLinearization, FmuPoint, initialize_at, step_from
-from .model_exchange_members import ModelExchangeMembers
 from .restored_point import RestoredPoint
 from .slope_check import SlopeCheck, check_slopes
 
@@ -32,23 +29,23 @@ STEP = 1e-4
 
 
 @accepts(
-    "{block.label}",
+    "{setup.label}",
     ParameterError,
     interface=kinds.choice("model_exchange", "co_simulation")
     .or_none()
     .worded("'model_exchange', 'co_simulation' or None", "Give one."),
 )
 def linear_model(
-    block: FmuBlock, t: float, state: Any, inputs: Any, interface: str | None, exact: bool | None
+    setup: FmuSetup, t: float, state: Any, inputs: Any, interface: str | None, exact: bool | None
 ) -> FmuLinearization:
     """Linearize an FMU's equations; see `Fmu.linear_model`."""
-    point = FmuPoint(block, t, state, inputs)
+    point = FmuPoint(setup, t, state, inputs)
     about = point.about
     if not about.states:
         raise FmuError(
             "its model structure lists no derivatives of continuous states that are Float64 variables, so its "
             "equations can't be linearized. Use step_difference(), or identify it from a run.",
-            block=block.label,
+            block=setup.label,
         )
     derived_too = not point.sets_parameters  # the standard has directional derivatives by inputs and states alone
     settable = all(about.find(name).initial == "exact" for name in about.states)
@@ -70,7 +67,7 @@ def linear_model(
         f"{'there' if about.model_exchange_has_derivatives else 'not there'} and "
         f"{'in' if about.has_derivatives else 'not in'} co-simulation, and states that "
         f"{'can' if settable else 'cannot'} be set at the start. Leave out interface and exact.",
-        block=block.label,
+        block=setup.label,
     )
 
 
@@ -91,12 +88,12 @@ def _enter_continuous_time(point: FmuPoint, instance: LoadedFmu) -> None:
         raise FmuError(
             f"the FMU asks to end the simulation (terminateSimulation) at t = {point.t:.9g} s, in an event there, so "
             "it has no linear model there. Choose another operating point.",
-            block=point.block.label,
+            block=point.setup.label,
         )
     if found.again:
         raise FmuError(
             "the events at the start don't settle in 100 rounds. Choose another operating point.",
-            block=point.block.label,
+            block=point.setup.label,
         )
     instance.call("entering Continuous-Time Mode", instance.fmi.enter_continuous_time_mode)
     guessed = [
@@ -265,87 +262,22 @@ def _differences(point: FmuPoint, instance: LoadedFmu, values: np.ndarray) -> Di
     return differentiate(column, values, evaluate)
 
 
-# --- a run in model exchange -----------------------------------------------------------------------------------------
-
-
-def find_exchange_slopes(
-    block: ModelExchangeMembers,
-    wired: Sequence[str],
-    values: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    x: np.ndarray,
-    u: np.ndarray,
-) -> Differences:
-    """Return the derivative of ``values(x, u)``, flat, by (x, u) of model exchange, by differences.
-
-    Wired inputs are moved; others, and those without derivatives, have zero columns.
-    """
-    about, places = block.description, Layout.of({p: v.shape for p, v in block.input_variables.items()}).slices
-    moved = {port: v for port, v in block.input_variables.items() if port in wired and is_smooth(v)}
-    parts = [(v, x, where) for v, where in _states_in(block)]
-    parts += [(v, u, places[port]) for port, v in moved.items()]
-    base = values(x, u)
-    many = x.size + u.size
-    made = Differences(np.zeros((base.size, 0)), np.zeros((base.size, 0)), np.zeros(0), base).place([], many)
-    for variable, vector, where in parts:
-        column = Column(about, [variable.name], vector[where], EQUATIONS)
-
-        def evaluate(name: str, moved: np.ndarray, vector: np.ndarray = vector, where: slice = where) -> np.ndarray:
-            changed = vector.copy()
-            changed[where] = moved
-            return values(changed, u) if vector is x else values(x, changed)
-
-        first = where.start if vector is x else x.size + where.start
-        made += differentiate(column, base, evaluate).place([*range(first, first + variable.size)], many)
-    return made
-
-
-def _states_in(block: ModelExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:
-    """Yield the variables of the continuous states, and where they are among these."""
-    about = block.description
-    layout = about.layout(about.states).slices
-    yield from ((about.find(name), layout[name]) for name in about.states)
-
-
-def check_exchange_slopes(
-    block: ModelExchangeMembers,
-    wired: Sequence[str],
-    values: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    x: np.ndarray,
-    u: np.ndarray,
-    J: np.ndarray,
-) -> SlopeCheck:
-    """Return the FMU's own derivatives ``J`` of values by (x, u), held against differences; see `check_slopes`."""
-    places = Layout.of({p: v.shape for p, v in block.input_variables.items()}).slices
-    n = x.size
-    nominals, low, high = np.ones(n + u.size), np.full(n + u.size, -np.inf), np.full(n + u.size, np.inf)
-    moved = np.arange(n + u.size) < n
-    parts = list(_states_in(block))
-    for port, v in block.input_variables.items():
-        where = slice(n + places[port].start, n + places[port].stop)
-        moved[where] = port in wired and is_smooth(v)
-        parts.append((v, where))
-    for v, where in parts:
-        nominals[where] = np.ravel(v.nominals)
-        low[where], high[where] = (np.ravel(side) for side in v.limits)
-    return check_slopes(J, lambda at: values(at[:n], at[n:]), np.concatenate([x, u]), nominals, (low, high), moved)
-
-
 # --- a communication step ---------------------------------------------------------------------------------------------
 
 
-@accepts("{block.label}", ParameterError, h=kinds.positive, relative_step=kinds.positive)
+@accepts("{setup.label}", ParameterError, h=kinds.positive, relative_step=kinds.positive)
 def step_difference(
-    block: FmuBlock, h: float, t: float, state: Any, inputs: Any, relative_step: float
+    setup: FmuSetup, h: float, t: float, state: Any, inputs: Any, relative_step: float
 ) -> FmuLinearization:
     """Linearize a communication step; see `Fmu.step_difference`."""
-    point = FmuPoint(block, t, state, inputs)
+    point = FmuPoint(setup, t, state, inputs)
     about = point.about
     for name in point.states:
         if about.find(name).initial != "exact":
             raise FmuError(
                 "its state has no exact start value, and co-simulation allows to set it at the start only. Use "
                 "linear_model() through model exchange, or identify it from a run.",
-                block=block.label,
+                block=setup.label,
                 port=name,
             )
     with initialize_at(point, exchange=False) as instance:
@@ -381,7 +313,7 @@ def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_ste
             raise FmuError(
                 f"it ends its step from t = {point.t:.9g} s by {h:g} s early, or asks to end the simulation in it "
                 "(terminateSimulation), so the step has no derivative. Take a smaller h, or another operating point.",
-                block=point.block.label,
+                block=point.setup.label,
             )
         return instance.values([*point.states, *point.outputs])
 
@@ -408,14 +340,14 @@ def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_ste
 
 
 def find_step_gap(
-    block: FmuBlock, h: float, t: float, state: Any, inputs: Any, A: np.ndarray, B: np.ndarray
+    setup: FmuSetup, h: float, t: float, state: Any, inputs: Any, A: np.ndarray, B: np.ndarray
 ) -> tuple[float, float]:
     """Return how far a step is from a linear model of it, in one random direction, and the error of that distance.
 
     Both are relative to the model's own motion. States that can't be set at the start move as the FMU's initialization
     makes them: one may follow from those that are set. A and B are of the states after the step.
     """
-    point = FmuPoint(block, t, state, inputs)
+    point = FmuPoint(setup, t, state, inputs)
     about = point.about
     with initialize_at(point, exchange=False) as instance:
         found, names = {}, [*point.states, *point.inputs]

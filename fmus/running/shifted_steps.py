@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuError
-from ..calls import FmuBlock
+from .fmu import Fmu, setup_of
 from .fmu_point import FmuPoint, initialize_at, step_from
 
 
 def take_shifted_steps(
-    block: FmuBlock, h: float, t: float, state: Any, inputs: Any, shifts: Sequence[tuple[np.ndarray, np.ndarray]]
+    block: Fmu, h: float, t: float, state: Any, inputs: Any, shifts: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return states and outputs at the end of a step: from an operating point, then from each shifted point.
 
     Shifts are of all states and all inputs, as `FmuPoint.states` and `FmuPoint.inputs` lay them out.
     """
-    point = FmuPoint(block, t, state, inputs)
+    point = FmuPoint(setup_of(block), t, state, inputs)
     about = point.about
     names = [*point.states, *point.inputs]
     layout = about.layout(names)

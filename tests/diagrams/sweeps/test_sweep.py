@@ -490,7 +490,7 @@ def test_an_experiment_is_swept_to_its_end():
 
 
 def test_messages_of_runs_are_told_once(monkeypatch):
-    from loopwright.fmus.calls.loaded_library import LoadedFmu
+    from loopwright.fmus.calls.loaded_fmu import LoadedFmu
 
     begin = LoadedFmu.begin
 

@@ -17,6 +17,7 @@ from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, Isolation
 from loopwright.fmus.calls import LoadedFmu
 from loopwright.fmus.isolation import count_processes, end_idle
+from loopwright.fmus.running import setup_of
 from loopwright.frequency import margins
 from support.misstated import misstated_fmu
 from support.waiting import FAR, is_there, wait_for
@@ -285,7 +286,7 @@ def test_what_it_writes_into_its_resources_is_not_there_in_the_next_run(folder):
 def test_a_foreign_fmu_is_not_reset_but_made_anew(folder, isolate):
     """Its reset fails; a fresh instance begins at y = 0 again."""
     plant = Fmu(zoo_fmu(folder, 3, "reset error"), name="plant", isolate=isolate)
-    one = LoadedFmu(plant)
+    one = LoadedFmu(setup_of(plant))
     try:
         for _ in range(3):
             one.initialize(None, values={"u": 1.0})
@@ -300,7 +301,7 @@ def test_a_foreign_fmu_is_not_reset_but_made_anew(folder, isolate):
 
 
 def test_an_own_build_is_reset(msd, monkeypatch):
-    one = LoadedFmu(Fmu(msd, name="plant"))
+    one = LoadedFmu(setup_of(Fmu(msd, name="plant")))
     calls = []
     try:
         monkeypatch.setattr(one.fmi, "renew", lambda log, running: calls.append("renew"))

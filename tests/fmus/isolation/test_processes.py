@@ -17,8 +17,8 @@ from loopwright.blocks import ParameterError
 from loopwright.blocks.core import Wanted
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, FmuProcessError, FmuRuntimeError, Isolation
-from loopwright.fmus.calls import find_limits
 from loopwright.fmus.isolation import count_processes, end_idle
+from loopwright.fmus.running import setup_of
 from loopwright.types import FmuEnd
 from support.exported import mass_spring_damper
 from support.waiting import Interruption, wait_for
@@ -300,13 +300,13 @@ def test_a_crash_in_model_exchange_names_the_time(msd, wait):
 
 
 def test_foreign_fmus_are_isolated_and_own_builds_are_not(folder, msd, tmp_path):
-    assert find_limits(Fmu(zoo_fmu(folder, 3))) == Isolation()
-    assert find_limits(Fmu(msd)) is None
+    assert setup_of(Fmu(zoo_fmu(folder, 3))).process_limits == Isolation()
+    assert setup_of(Fmu(msd)).process_limits is None
     copy = tmp_path / "copy.fmu"
     copy.write_bytes(msd.read_bytes())
-    assert find_limits(Fmu(copy)) is None  # its content counts
-    assert find_limits(Fmu(msd, isolate=True)) == Isolation()
-    assert find_limits(Fmu(zoo_fmu(folder, 3), isolate=False)) is None
+    assert setup_of(Fmu(copy)).process_limits is None  # its content counts
+    assert setup_of(Fmu(msd, isolate=True)).process_limits == Isolation()
+    assert setup_of(Fmu(zoo_fmu(folder, 3), isolate=False)).process_limits is None
 
 
 def test_a_cache_that_others_can_write_proves_nothing(msd, cache):
@@ -314,10 +314,10 @@ def test_a_cache_that_others_can_write_proves_nothing(msd, cache):
     mode = noted.stat().st_mode
     noted.chmod(0o777)
     try:
-        assert find_limits(Fmu(msd)) is not None
+        assert setup_of(Fmu(msd)).process_limits is not None
     finally:
         noted.chmod(mode)
-    assert find_limits(Fmu(msd)) is None
+    assert setup_of(Fmu(msd)).process_limits is None
 
 
 def test_a_wrong_limit_is_refused(msd):

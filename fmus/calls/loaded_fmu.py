@@ -1,4 +1,4 @@
-"""Library of an FMU, loaded in this process or in another one, with one instance."""
+"""Instance of an FMU, whose library is loaded in this process or in another one."""
 
 from __future__ import annotations
 
@@ -15,21 +15,31 @@ from ...blocks.core import (
     FmuFileError,
     FmuProcessError,
     FmuRuntimeError,
+    SimulationError,
     UnknownNameError,
     describe_disk_error,
     near,
 )
 from ..archive import FmuFault, FmuVariable, inexact, unpack
 from ..host_state import FOLDER, HostState
+from ..isolation import Isolation
 from ..platform import is_built_here
-from .fmi_calls import FATAL
-from .fmu_block import FmuBlock
-from .loading import find_limits, load_calls
+from .fmi_calls import FATAL, WARNING
+from .fmu_setup import FmuSetup
+from .loading import load_calls
 from .message_log import MessageLog, clean_text, describe_end
 from .model_exchange_calls import order_questions
 from .step_options import choose_modes
-from .text_values import is_readable, list_limits, read_text, waits_for_initialization, write_text
-from .transfer import BoundReading, BoundStart, is_kept
+from .text_values import (
+    Text,
+    TextRecord,
+    is_readable,
+    list_limits,
+    read_text,
+    waits_for_initialization,
+    write_text,
+)
+from .transfer import BoundReading, BoundStart, OutOfRangeError, Transfer, UnfitError, is_kept
 
 R = TypeVar("R")
 _SET = ("parameter", "input", "structuralParameter")
@@ -38,62 +48,91 @@ _OPEN: WeakSet[LoadedFmu] = WeakSet()
 
 
 class LoadedFmu:
-    """Instance of an FMU: log, initialization, variables, end."""
+    """Instance of an FMU: its log, initialization, variables, statuses of its calls, and end.
 
-    def __init__(self, block: FmuBlock, *, model_exchange: bool = False):
-        self.block, self.description = block, block.description
-        self.model_exchange, self.failed, self.fatal = model_exchange, False, False
-        self.log = MessageLog(block.label, list_limits(block.label, self.description, model_exchange=model_exchange))
-        self._open = self._running = False
+    Attributes
+    ----------
+    inputs : dict of str to FmuVariable
+        Variables of the input ports that are wired.
+    record : TextRecord
+        Texts and binary data that are recorded.
+    is_open, is_running : bool
+        Whether it is there, and whether its initialization is over.
+    failed, fatal : bool
+        Whether one of its functions has failed, and whether nothing may be called any more.
+    ends_run : bool
+        Whether the FMU has asked to end the simulation (terminateSimulation).
+    on_end : callable or None
+        Called when it does so at the end of a step; without it the request is an error.
+    is_trial : bool
+        Whether a step may be taken back; an input out of its range is then kept in `refused`, and no error yet.
+    refused : SimulationError or None
+        Error of an input that was out of its range in a trial step.
+    """
+
+    failed = fatal = ends_run = is_trial = False
+    on_end: Callable[[], None] | None = None
+    refused: SimulationError | None = None
+
+    def __init__(self, setup: FmuSetup, wired: Sequence[str] = (), *, model_exchange: bool = False):
+        self.setup, self.description, self.model_exchange = setup, setup.description, model_exchange
+        self.log = MessageLog(setup.label, list_limits(setup.label, self.description, model_exchange=model_exchange))
+        self.is_open = self.is_running = False
         self._start: BoundStart | None = None
         self._began, self._given, self.is_built_here = 0.0, dict[str, Any](), is_built_here(self.description.digest)
-        description, self.host = self.description, HostState(self.add_note)
-        limits, exchange = find_limits(block), description.exchange
+        self.host = HostState(self.add_note)
+        self._load(setup.process_limits)
+        self.is_open = True
+        if self.description.only_once and self.fmi.in_process:
+            _OPEN.add(self)
+        self.inputs = {port: setup.input_variables[port] for port in wired}
+        self.record = TextRecord(self.fmi, setup.text_variables)
+
+    def _load(self, limits: Isolation | None) -> None:
+        """Load its library, in a process with limits or in this one, and make the instance."""
+        setup, description, exchange = self.setup, self.description, self.description.exchange
         if limits is None:
             self._refuse_second()
-        library = exchange.binary if model_exchange and exchange is not None else description.binary
+        library = exchange.binary if self.model_exchange and exchange is not None else description.binary
         try:
             files = unpack(description)
         except FmuError as error:
-            error.at(block=block.label)
+            error.at(block=setup.label)
             raise
         # FMPy stays in the binary's folder if loading fails, too; another process has its own folder
         with FOLDER if limits is None else nullcontext(), self.host:
             try:
                 self.fmi = load_calls(
-                    block,
+                    setup,
                     limits,
-                    name=block.label,
+                    name=setup.label,
                     token=description.token,
                     folder=files,
                     library=files / library,
-                    model_exchange=model_exchange,
+                    model_exchange=self.model_exchange,
                 )
                 self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, BoundReading(self.fmi)
                 if self.fmi.in_process and not self.is_built_here:
                     self.fmi.settle_by(self.host.settle)
                 self._check_version()
-                if not model_exchange:
-                    choose_modes(self.fmi, description, block.stepping)
+                if not self.model_exchange:
+                    choose_modes(self.fmi, description, setup.stepping)
                 self.fmi.instantiate(self.log.take)
             except FmuProcessError as error:
                 raise self.lose(error) from None
             except FmuError as error:
                 self._end_calls()
-                error.at(block=block.label)
+                error.at(block=setup.label)
                 raise
             except Exception as error:
                 self._end_calls()
                 step = f"Look for its fault with 'loopwright doctor {description.file}'."
                 if isinstance(error, OSError) and error.errno is not None:  # not the loader's, which is a text alone
-                    found = f"{describe_disk_error(error, files, step)}{self._quote_messages()}"
+                    found = f"{describe_disk_error(error, files, step)}{self.quote_messages()}"
                 else:
-                    found = f"{error}{self._quote_messages()} {step}"
+                    found = f"{error}{self.quote_messages()} {step}"
                 text = f"the FMU {str(description.file)!r} can't be loaded: {found}"
-                raise FmuFileError(text, fault=FmuFault.LOADING, block=block.label) from error
-        self._open = True
-        if description.only_once and self.fmi.in_process:
-            _OPEN.add(self)
+                raise FmuFileError(text, fault=FmuFault.LOADING, block=setup.label) from error
 
     def _end_calls(self) -> None:
         """Give up the calls after an error in the course of loading."""
@@ -105,8 +144,8 @@ class LoadedFmu:
         if not self.fatal:
             self.failed = self.fatal = True
             self._end_calls()
-            error.add(describe_end(error, self._quote_messages()))
-        return error.at(block=self.block.label, t=self.t)
+            error.add(describe_end(error, self.quote_messages()))
+        return error.at(block=self.setup.label, t=self.t)
 
     def _refuse_second(self) -> None:
         """Refuse a second instance in this process where the FMU can have one only."""
@@ -114,9 +153,9 @@ class LoadedFmu:
             if self.description.only_once and other.description.digest == self.description.digest:
                 raise FmuError(
                     f"its FMU {str(self.description.file)!r} can have one instance in a process "
-                    f"(canBeInstantiatedOnlyOncePerProcess), and {other.block.label} is one. End that run first, or "
+                    f"(canBeInstantiatedOnlyOncePerProcess), and {other.setup.label} is one. End that run first, or "
                     "run them in separate processes.",
-                    block=self.block.label,
+                    block=self.setup.label,
                 )
 
     def _check_version(self) -> None:
@@ -126,7 +165,7 @@ class LoadedFmu:
             raise FmuFileError(
                 f"the library of {str(self.description.file)!r} says that it is of FMI {version!r} "
                 f"({self.fmi.prefix}GetVersion); expected {expected!r}, as its description says. Export it again.",
-                block=self.block.label,
+                block=self.setup.label,
             )
 
     @property
@@ -138,7 +177,8 @@ class LoadedFmu:
         """Add a message of this library, which is not the FMU's own."""
         self.log.note(text)
 
-    def _quote_messages(self) -> str:
+    def quote_messages(self) -> str:
+        """Return the end of a sentence, with the FMU's last messages if there are any."""
         return self.log.quote()
 
     @property
@@ -165,10 +205,10 @@ class LoadedFmu:
         """
         with self.host:
             self._began, self._start = start_time, None
-            given = self._given = {**self.block.start, **(values or {})}
+            given = self._given = {**self.setup.start, **(values or {})}
             try:
                 self._configure(given)
-                tolerance, stop = self.block.stepping.tolerance, self.block.stepping.stop_time
+                tolerance, stop = self.setup.stepping.tolerance, self.setup.stepping.stop_time
                 stop_time = stop if stop_time is None else stop_time
                 self.fmi.set_up(start_time, stop_time, tolerance)
                 in_mode = {n: v for n, v in given.items() if waits_for_initialization(self.description, n)}
@@ -190,11 +230,11 @@ class LoadedFmu:
             kept = self.values([name]).tolist() if text is None else read_text(self.fmi, text)
             put = value if text is not None else np.ravel(value).tolist()
             advice = "Leave it out, or set the parameters that it depends on."
-            if name in (v.name for v in self.block.input_variables.values()):
+            if name in (v.name for v in self.setup.input_variables.values()):
                 advice = "Wire it, with Constant, say: a wire sets it before each step."
             raise FmuRuntimeError(
                 f"its start value was set to {put!r}, but is {kept!r}{moment}: the FMU does not keep it. {advice}",
-                block=self.block.label,
+                block=self.setup.label,
                 port=f"start.{name}",
                 t=self._began,
             )
@@ -230,8 +270,8 @@ class LoadedFmu:
             return self.lose(error)
         self._note(error)
         return FmuRuntimeError(
-            f"initialization failed ({error}){self._quote_messages()} Check its start values.",
-            block=self.block.label,
+            f"initialization failed ({error}){self.quote_messages()} Check its start values.",
+            block=self.setup.label,
             t=self._began,
         )
 
@@ -243,9 +283,10 @@ class LoadedFmu:
         if self.is_built_here:
             self.call("resetting it", self.fmi.reset)
         else:
-            self.call("making it again", self.fmi.renew, self.log.take, self._running and not self.failed)
+            self.call("making it again", self.fmi.renew, self.log.take, self.is_running and not self.failed)
             self._reading = BoundReading(self.fmi)
-        self.failed = self._running = False
+        self.failed = self.is_running = self.ends_run = False
+        self.refused = None
 
     def begin(self) -> None:
         """Leave Initialization Mode."""
@@ -253,9 +294,9 @@ class LoadedFmu:
             self.fmi.exit_initialization_mode()
         except Exception as error:
             raise self._initialization_error(error) from error
-        self._running = True
+        self.is_running = True
         if self._start is None or not self._start.are_kept():
-            others = {*self.description.texts, *(v.name for v in self.block.input_variables.values())}  # set again
+            others = {*self.description.texts, *(v.name for v in self.setup.input_variables.values())}  # set again
             names = [n for n in self._given if n not in others and self.description.find(n).causality != "input"]
             self._refuse_lost(self._find_lost({n: self._given[n] for n in names}), " after its initialization")
         if self.fmi.event_mode_used:
@@ -283,9 +324,9 @@ class LoadedFmu:
         except Exception as error:
             self._note(error)
             raise FmuRuntimeError(
-                f"{purpose} failed ({error}){self._quote_messages()} Check that the FMU does as its description "
+                f"{purpose} failed ({error}){self.quote_messages()} Check that the FMU does as its description "
                 f"claims: loopwright validate {self.description.file}.",
-                block=self.block.label,
+                block=self.setup.label,
                 t=self.t,
             ) from error
 
@@ -333,7 +374,7 @@ class LoadedFmu:
                 raise FmuRuntimeError(
                     f"{purpose}: found {values[[inexact(v) for v in values]][0]}; expected at most 2**53 in size, up "
                     "to which a signal holds every integer. Leave this variable out.",
-                    block=self.block.label,
+                    block=self.setup.label,
                     t=self.t,
                 )
             found.append(values.astype(float))
@@ -368,12 +409,12 @@ class LoadedFmu:
             raise FmuError(
                 f"it has no directional derivatives: {about.derivatives_flag} is false in its description. Use "
                 "linear_model(), which falls back on differences.",
-                block=self.block.label,
+                block=self.setup.label,
             )
         for name in (*unknowns, *knowns):
             if name not in about.names:
                 text = f"it has no variable {name!r}. {near(name, about.names)}"
-                raise UnknownNameError(text, block=self.block.label)
+                raise UnknownNameError(text, block=self.setup.label)
         of, by = ([about.find(name) for name in names] for names in (unknowns, knowns))
         n = sum(v.size for v in of)
         if not n:
@@ -410,19 +451,80 @@ class LoadedFmu:
             ask()
         return np.concatenate([found["rates"], found["values"] if names else np.zeros(0)])
 
+    # ---- statuses of its calls, and values that don't fit ----
+
+    def judge(self, action: str, status: int, t: float) -> None:
+        """Note a warning, once for each action; raise the error of a status that is worse."""
+        if status > WARNING:
+            raise self.report(action, status, t)
+        if status:
+            self.log.warn(action, self.fmi.status_name(status), t)
+
+    def report(self, action: str, status: int, t: float) -> FmuRuntimeError:
+        """Return the error of an action that has failed with a status."""
+        raise NotImplementedError
+
+    def check_limits(self, inputs: Transfer, t: float) -> None:
+        """Refuse inputs out of the range that the FMU states, in a trial step only if it is accepted."""
+        try:
+            inputs.check_limits()
+        except UnfitError as error:
+            refused = self.refuse(error, t)
+            if not self.is_trial:
+                raise refused from None
+            self.refused = self.refused or refused
+
+    def refuse(self, error: UnfitError, t: float) -> FmuRuntimeError:
+        """Return the error of an input or output that doesn't fit."""
+        if isinstance(error, OutOfRangeError):
+            advice = "Limit the signal before this input, with Saturation, say."
+        elif error.port in self.inputs:
+            advice = "Convert the signal before this input, with Quantizer, say."
+        else:
+            advice = "Leave this output out, by ports=."
+        return FmuRuntimeError(f"{error.reason}. {advice}", block=self.setup.label, port=error.port, t=t)
+
+    # ---- texts, and the point at which it is ----
+
+    @property
+    def texts(self) -> Mapping[str, list[tuple[float, Text]]]:
+        """Texts and binary data by port: each value with the time in s from which on it held."""
+        return self.record.values
+
+    def begin_texts(self, t: float) -> None:
+        """Let the record of texts continue from a time in s."""
+        for text in self.call("reading its texts", self.record.go_back, t):
+            self.add_note(text)
+
+    def note_texts(self, t: float) -> None:
+        """Record the texts that have changed, at a time in s."""
+        if self.record.variables:
+            self.call("reading its texts", self.record.note, t)
+
+    def operating_point(self) -> dict[str, Any]:
+        """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model` and `Fmu.step_difference`."""
+        about = self.description
+
+        def read(variable: FmuVariable) -> np.ndarray:
+            return self.read_variables([variable]).reshape(variable.shape)
+
+        state = {name: read(about.find(name)) for name in (*about.states, *about.discrete_states)}
+        inputs = {port: read(variable) for port, variable in self.setup.input_variables.items()}
+        return {"t": self.t, "state": state, "inputs": inputs}
+
     # ---- the end ----
 
     def close(self) -> None:
         """Terminate and free the instance; what fails then is noted, as the run is complete."""
-        if not self._open:
+        if not self.is_open:
             return
-        self._open = False
+        self.is_open = False
         _OPEN.discard(self)
         with self.host:
             try:
                 if self.fatal:  # nothing may be called any more, not even to free it (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)
                     return
-                if self._running and not self.failed:
+                if self.is_running and not self.failed:
                     self._end_by(self.fmi.terminate)
                 if not self.fatal:
                     self._end_by(self.fmi.free_instance)
