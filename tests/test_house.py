@@ -44,8 +44,7 @@ ALLOWED = {
     "fmus/export/inlined.py": {"#define LW_N_Z 0\n"},  # C code of our own
     "fmus/export/own_sources.py": {'^#include "(.*)"$'},  # C code of our own
     "fmus/export/target_code.py": {  # C code of our own
-        "if (",
-        r"^static [^\n;=]*\b(lw_\w+)\([^\n]*\) \{(?:[^\n]*\}|\n.*?^\})\n",
+        r"^static [^\n;=]*\b(lw_\w+)\([^\n]*\) \{(?:[^\n]*\}|\n.*?^\})\n"
     },
     "fmus/export/target_measure.py": {r"undefined symbol: (\w+)", "bkpt"},  # a linker's output; an instruction
     "fmus/export/python_slave.py": {"linux"},  # sys.platform

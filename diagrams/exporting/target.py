@@ -25,7 +25,6 @@ from ...fmus.export import (
     split_lookups,
     unit_name,
     write_c,
-    write_loop_c,
 )
 from ..flat import FlatDiagram, TickPattern, bits_of, kinds_of, share_terms, speed_up, trace_guarded_tick
 from ..wiring import join
@@ -132,7 +131,7 @@ def to_c(
         base = float(opened.wired.flatten().base)
         loop = loop_spec(opened, name=unit_name(label), description=about, solver="rk4", step_size=base)
         _check_names(loop)
-        return write_loop_c(loop, Path(folder).expanduser(), own_functions=own_functions)
+        return write_c(loop, Path(folder).expanduser(), own_functions=own_functions)
     spec = target_spec(opened, name=unit_name(label), description=about)
     return write_c(spec, Path(folder).expanduser(), number=number, own_functions=own_functions)
 

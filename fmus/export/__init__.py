@@ -1,21 +1,25 @@
 """Export of a block as an FMU: equations, C code, model description, binaries."""
 
+from .c_names import unit_name
+from .c_text import c_number
 from .compiler import compile_shared, compile_webassembly, describe_compiler
 from .fmu_package import build_fmu, clear_cache
 from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
-from .loop_code import write_loop_c
-from .loop_memory import Field, LoopMemory, c_number
+from .loop_memory import Field, LoopMemory
 from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, Slopes, write_unit
 from .merged_plants import MergedPlant, PlacedPlant
 from .model_spec import INTEGRATORS, Integrator, ModelSpec, Variable, check_ascii
 from .own_sources import read_own_sources
 from .python_fmu import build_python
-from .scalar_code import Lookup, split_lookups
-from .target_code import Number, TargetText, TickFacts, unit_name, write_target
-from .target_files import TargetCode, TargetMeasurement, write_c
-from .target_measure import PROCESSORS, ProcessorMeasurement, measure, run_here
+from .scalar_operations import Lookup, split_lookups
+from .target_code import write_target
+from .target_files import TargetCode, write_c
+from .target_measure import PROCESSORS, ProcessorMeasurement, TargetMeasurement, measure, run_here
+from .target_members import Number
 from .target_spec import CLOCK_LIMIT, BlockOutput, Kept, TargetNumbers, TargetSpec, TargetTick
+from .target_text import TargetText
+from .tick_text import TickFacts
 from .tuning import describe_processor, processor_flags, tune
 from .written_equations import WrittenEquations, read_equations
 
@@ -73,7 +77,6 @@ __all__ = [
     "tune",
     "unit_name",
     "write_c",
-    "write_loop_c",
     "write_target",
     "write_unit",
 ]

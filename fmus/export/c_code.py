@@ -18,6 +18,7 @@ import casadi as ca
 
 from ...blocks.core import DefinitionError, lay_out, rate_of
 from ..runtime import read_sources
+from .c_text import c_array
 from .elementary_tables import prepare_functions, restore_functions
 from .model_spec import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
 
@@ -249,26 +250,19 @@ def _table(entries: Iterable[Entry]) -> str:
 
 def _starts(entries: Iterable[Entry]) -> str:
     values = [v for e in entries for v in (e.variable.flat_start or [0.0] * e.variable.size)]
-    return _array("double", "lw_start_values", map(repr, values))
-
-
-def _array(of: str, name: str, values: Iterable[object]) -> str:
-    """Return the C text of an array, of at least one element, since C has no empty arrays."""
-    texts = [str(v) for v in values] or ["0"]
-    lines = [", ".join(texts[i : i + 8]) for i in range(0, len(texts), 8)]
-    return f"static const {of} {name}[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
+    return c_array("double", "lw_start_values", map(repr, values))
 
 
 def _tables(spec: ModelSpec, nonzeros: list[tuple[int, int]] | None) -> Iterable[str]:
     """Yield the C tables of nominal values of continuous states, of events, and of the Jacobian's nonzeros."""
     nominals = [1.0 if v.nominal is None else float(v.nominal) for v in spec.continuous for _ in range(v.size)]
-    yield _array("double", "lw_nominals", map(repr, nominals))
+    yield c_array("double", "lw_nominals", map(repr, nominals))
     if spec.events:
         rows = [f'{{"{e.name}", {DIRECTIONS[e.direction]}, {float(e.nominal)!r}}}' for e in spec.events]
-        yield _array("lw_event", "lw_events", rows)
+        yield c_array("lw_event", "lw_events", rows)
     if nonzeros is not None:
-        yield _array("int", "lw_jacobian_rows", (row for row, _ in nonzeros))
-        yield _array("int", "lw_jacobian_columns", (column for _, column in nonzeros))
+        yield c_array("int", "lw_jacobian_rows", (row for row, _ in nonzeros))
+        yield c_array("int", "lw_jacobian_columns", (column for _, column in nonzeros))
 
 
 def _dimensions(spec: ModelSpec, token: str, equations: _Functions, n: int, fmi: int) -> str:

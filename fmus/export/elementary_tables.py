@@ -16,12 +16,15 @@ from math import factorial, frexp, ldexp
 
 import numpy as np
 
+from .c_text import c_array
+
 FUNCTIONS = ("sin", "cos", "tanh", "exp", "expm1", "log", "pow")
 """The functions that are our own; others (such as atan2) are the platform's."""
 SINGLE_FUNCTIONS = (*FUNCTIONS, "floor", "ceil", "fmin", "fmax")
 """Those of single precision: with what a processor for it has no instruction for."""
 _NODES = 306  # of tanh, up to which it differs from 1
 _DIGITS = 60
+_PER_LINE = 6
 
 
 def read_runtime(name: str) -> str:
@@ -70,9 +73,7 @@ def _write_single(value: Decimal) -> str:
 
 
 def _single_array(name: str, values: Iterable[Decimal]) -> str:
-    texts = [_write_single(v) for v in values]
-    lines = [", ".join(texts[i : i + 6]) for i in range(0, len(texts), 6)]
-    return f"static const float {name}_single[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
+    return c_array("float", f"{name}_single", map(_write_single, values), per_line=_PER_LINE)
 
 
 def _single_constants(**values: Decimal) -> str:
@@ -85,9 +86,8 @@ def _write(value: Decimal) -> str:
 
 
 def _array(name: str, values: Iterable[Decimal], of: str = "double") -> str:
-    texts = [_write(v) if of == "double" else f"0x{int(v):08x}u" for v in values]
-    lines = [", ".join(texts[i : i + 6]) for i in range(0, len(texts), 6)]
-    return f"static const {of} {name}[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
+    texts = (_write(v) if of == "double" else f"0x{int(v):08x}u" for v in values)
+    return c_array(of, name, texts, per_line=_PER_LINE)
 
 
 def _constants(**values: Decimal) -> str:

@@ -91,6 +91,7 @@ def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
     folder = Path(__file__).parent
     written = [
         "c_code",
+        "c_text",
         "elementary_tables",
         "html_page",
         "fmu_package",

@@ -13,7 +13,8 @@ from functools import lru_cache
 from html import escape
 
 from ...blocks.core import lay_out
-from .c_code import ORDER, Entry, Kind, _array, _rate, _starts, _table
+from .c_code import ORDER, Entry, Kind, _rate, _starts, _table
+from .c_text import c_array
 from .elementary_tables import read_runtime
 from .html_page import page_of
 from .loop_spec import LoopSpec, Placed, write_unit
@@ -141,7 +142,7 @@ def generate_loop(spec: LoopSpec, token: str, fmi: int) -> str:
         _starts(entries),
         *_places(spec),
         *_labels(spec),
-        _array("char *const", "lw_clock_names", (f'"{clock.name}"' for clock in clocks)) if clocks else "",
+        c_array("char *const", "lw_clock_names", (f'"{clock.name}"' for clock in clocks)) if clocks else "",
         "static const double lw_nominals[] = {1.0};\n",
         "".join(f'#include "{name}"\n' for name in RUNTIME[fmi][1:]),
     ]
@@ -182,7 +183,7 @@ def _places(spec: LoopSpec) -> Iterator[str]:
             if kind in kinds
             for place in one.places
         ]
-        yield _array("int32_t", f"lw_places_{letter}", found)
+        yield c_array("int32_t", f"lw_places_{letter}", found)
 
 
 def _code_of(spec: LoopSpec, one: Placed, place: int) -> int:
@@ -202,7 +203,7 @@ def _slopes(spec: LoopSpec) -> Iterator[str]:
     index = {entry: i for i, entry in enumerate(slopes.entries)}
     outputs = [one for kind, one in loop_rows(spec) if kind == "output"]
     found = [index[place] if one.vector == "log" else -1 - place for one in outputs for place in one.places]
-    yield _array("int32_t", "lw_slope_places", found)
+    yield c_array("int32_t", "lw_slope_places", found)
     yield f"#define LW_N_SLOPES {len(slopes.entries) + slopes.rates}"
     yield f"#define LW_FIRST_RATE {len(slopes.entries)}"
     yield f"#define LW_HAS_START_SLOPES {int(bool(slopes.start))}"
@@ -234,7 +235,7 @@ def _labels(spec: LoopSpec) -> Iterator[str]:
     """Yield the table of the outputs of blocks."""
     yield "typedef struct {\n    const char *block, *port;\n    uint32_t first, size;\n} lw_label;\n"
     rows = [f'{{"{block}", "{port}", {first}, {size}}}' for block, port, first, size in spec.labels]
-    yield _array("lw_label", "lw_labels", rows or ['{"", "", 0, 0}'])
+    yield c_array("lw_label", "lw_labels", rows or ['{"", "", 0, 0}'])
 
 
 @lru_cache(maxsize=2)

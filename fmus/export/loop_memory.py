@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .c_text import c_array, c_number
+
 _C_TYPES = {"float64": "double", "int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t"}
-_LINE = 8  # values in a line of a table
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +79,7 @@ class LoopMemory:
 
     def _tables(self) -> Iterator[str]:
         for field, start in self._started():
-            texts = [c_number(value) for value in start.tolist()]
-            lines = [", ".join(texts[i : i + _LINE]) for i in range(0, len(texts), _LINE)]
-            yield f"static const {field.kind} lw_start_{field.name}[] = {{\n    " + ",\n    ".join(lines) + "\n};"
+            yield c_array(field.kind, f"lw_start_{field.name}", map(c_number, start.tolist())).rstrip()
 
     def _fill(self) -> Iterator[str]:
         yield "static void lw_fill(lw_memory *m) {"
@@ -98,20 +97,3 @@ class LoopMemory:
         yield "    (void)m;"
         yield from (f"    m->{member} = NULL;" for member, _ in self.pointers)
         yield "}\n"
-
-
-def c_text(text: str) -> str:
-    """Return a text as a C string."""
-    escaped = (f"\\{byte:03o}" if byte < 32 or byte > 126 or byte in b'"\\?' else chr(byte) for byte in text.encode())
-    return f'"{"".join(escaped)}"'
-
-
-def c_number(value: float) -> str:
-    """Return a number as C text, exactly."""
-    if isinstance(value, int):
-        return str(value)
-    if value != value:
-        return "NAN"
-    if value in (np.inf, -np.inf):
-        return "-INFINITY" if value < 0 else "INFINITY"
-    return repr(float(value))

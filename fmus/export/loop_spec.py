@@ -13,8 +13,9 @@ from typing import Any
 
 from ...blocks.core import brief, count_of
 from ..runtime import read_sources
+from .c_text import c_number, c_text
 from .elementary_tables import prepare_functions, read_runtime, restore_functions
-from .loop_memory import LoopMemory, c_number, c_text
+from .loop_memory import LoopMemory
 from .merged_plants import MergedPlant, describe_plants, plant_fields, write_plants
 from .model_spec import Variable
 

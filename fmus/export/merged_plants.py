@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from .loop_memory import Field, c_number
+from .c_text import c_number
+from .loop_memory import Field
 from .own_sources import expand_sources, name_apart
 
 SAID = 512

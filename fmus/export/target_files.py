@@ -2,43 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import accepts, explain_calls, explain_disk_errors, kinds, write_text
-from .target_code import Number, TargetText, TickFacts, write_target
-from .target_measure import PROCESSORS, ProcessorMeasurement, measure, run_here
+from ...blocks.core import OptionError, accepts, explain_calls, explain_disk_errors, kinds, write_text
+from .loop_code import write_loop_target
+from .loop_spec import LoopSpec
+from .target_code import write_target
+from .target_measure import PROCESSORS, TargetMeasurement, measure, run_here
+from .target_members import Number
+from .target_report import report_lines
 from .target_spec import TargetSpec
+from .target_text import TargetText
 
 _HELD = 200
 """Ticks that are counted where no test signal is given: the start values of the inputs are held."""
-
-
-@explain_calls
-@dataclass(frozen=True, eq=False)
-class TargetMeasurement:
-    """C for a target, measured with a test signal.
-
-    Attributes
-    ----------
-    ticks : int
-        Ticks of the test signal.
-    processors : tuple of ProcessorMeasurement
-        By processor: memory, stack and instructions.
-    float_error : mapping of str to float
-        By output and signal: the largest difference between single and double precision; empty in double precision.
-    missing : tuple of str
-        What could not be measured, and why.
-    """
-
-    ticks: int
-    processors: tuple[ProcessorMeasurement, ...]
-    float_error: Mapping[str, float]
-    missing: tuple[str, ...]
 
 
 @explain_calls
@@ -66,7 +47,7 @@ class TargetCode:
         The last measurement.
     """
 
-    def __init__(self, spec: TargetSpec, text: TargetText, folder: Path, own_functions: bool):
+    def __init__(self, spec: TargetSpec | LoopSpec, text: TargetText, folder: Path, own_functions: bool):
         self._spec, self._text, self._own = spec, text, own_functions
         self.name, self.number, self.folder = text.name, text.number, folder
         self.bytes_of, self.ticks = text.bytes_of, text.ticks
@@ -79,13 +60,10 @@ class TargetCode:
     def __str__(self) -> str:
         return self.report
 
-    def _contents(self) -> Mapping[str, str]:
-        return self._text.files
-
     def _write(self) -> None:
         with explain_disk_errors("the C code can't be written", self.folder, "Name another folder.", block=self.name):
             self.folder.mkdir(parents=True, exist_ok=True)
-            for name, text in self._contents().items():
+            for name, text in self._text.files.items():
                 write_text(self.folder / name, text)
             write_text(self.files[-1], self.report)
 
@@ -114,10 +92,18 @@ class TargetCode:
         Raises
         ------
         OptionError
-            For an input that it hasn't, values that don't fit, or another processor.
+            For an input that it hasn't, values that don't fit, or another processor; and for C with the loop of runs
+            inside, whose instructions depend on its events and equations.
         CompilerError
             If a tick of the signal fails, or a compiler warns.
         """
+        if isinstance(self._spec, LoopSpec):
+            raise OptionError(
+                "instructions are counted of sampled diagrams alone; this one has a solver inside, whose steps and "
+                "iterations depend on the data. Measure a tick on the target.",
+                block=self.name,
+                port="measure",
+            )
         given = dict(inputs or {})
         shapes = {m.variable.name: m.variable.shape for m in self._text.members if m.group == "inputs"}
         lengths = [len(np.asarray(v)) for n, v in given.items() if np.ndim(v) > len(shapes.get(n, ()))]
@@ -140,88 +126,22 @@ class TargetCode:
 
     @property
     def report(self) -> str:
-        """What each tick touches, memory, and what was measured, as text."""
-        return "\n".join(_report(self)) + "\n"
+        """Memory, what each tick touches, and what was measured, as text."""
+        return "\n".join(report_lines(self._spec, self._text, self.measured)) + "\n"
 
 
-def write_c(spec: TargetSpec, folder: Path, *, number: Number = "double", own_functions: bool = False) -> TargetCode:
-    """Write C for a target to a folder; see `write_target`.
+def write_c(
+    spec: TargetSpec | LoopSpec, folder: Path, *, number: Number = "double", own_functions: bool = False
+) -> TargetCode:
+    """Write C for a target to a folder: ticks alone, or with the loop of runs inside, in double precision.
 
+    ``own_functions``: see `write_target`.
     Raises `DiskError` if it can't be written.
     """
-    code = TargetCode(spec, write_target(spec, number=number, own_functions=own_functions), folder, own_functions)
+    if isinstance(spec, LoopSpec):
+        text = write_loop_target(spec, own_functions=own_functions)
+    else:
+        text = write_target(spec, number=number, own_functions=own_functions)
+    code = TargetCode(spec, text, folder, own_functions)
     code._write()
     return code
-
-
-def _report(code: TargetCode) -> Iterator[str]:
-    text, spec, size = code._text, code._spec.loop, code.bytes_of
-    yield f"{text.name}: C for a target, numbers in {text.number} precision"
-    yield ""
-    yield f"Call {text.name}_tick() every {float(spec.base):g} s."
-    functions = ", ".join(text.platform_functions)
-    yield f"Functions of math.h: {functions or 'none'}."
-    yield "No memory is allocated. Nothing in a tick loops but the search in a table, of log2(length) steps, and what"
-    yield "elementary functions do inside, such as sine for angles above a million."
-    yield ""
-    yield "Memory in bytes"
-    for group in ("parameters", "numbers", "inputs", "outputs", "signals", "states"):
-        yield f"  {group:<12}{size[group]:>7}"
-    yield f"  {'an instance':<12}{size['struct']:>7}   all of it, with the count of ticks"
-    yield f"  {'tables':<12}{size['tables']:>7}   constant, once for all instances"
-    for number, tick in enumerate(code.ticks):
-        yield ""
-        yield f"Tick {number}: {tick.when}"
-        yield from _facts(tick)
-    yield ""
-    yield from _measured(code.measured)
-
-
-def _facts(tick: TickFacts) -> Iterator[str]:
-    count = sum(tick.operations.values())
-    kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(tick.operations.items(), key=lambda one: -one[1]))
-    rows = {
-        "subsystems": tick.subsystems,
-        "blocks": tick.blocks,
-        "reads inputs": tick.inputs,
-        "parameters": tick.parameters,
-        "states": tick.read,
-        "writes states": tick.states,
-        "outputs": tick.outputs,
-        "operations": (f"{count} at most, whatever the data: {kinds}" if count else "none",),
-    }
-    for label, names in rows.items():
-        yield from _row(label, names)
-
-
-def _row(label: str, names: Iterable[str]) -> Iterator[str]:
-    line = f"  {label:<15}"
-    for name in [*names] or ["none"]:
-        if len(line) + len(name) > 100 and line.strip() != label:
-            yield line.rstrip()
-            line = " " * 17
-        line += f"{name}, "
-    yield line.rstrip(", ")
-
-
-def _measured(measured: TargetMeasurement | None) -> Iterator[str]:
-    if measured is None:
-        yield "Not measured: nothing was compiled. code.measure(inputs) compiles it and counts instructions."
-        return
-    yield f"Measured with a test signal of {measured.ticks} ticks"
-    for one in measured.processors:
-        memory = f"{one.code} bytes of instructions, {one.constants} of constants (without libraries)"
-        yield f"  {one.processor}, -O2: {memory}"
-        if one.instructions:
-            yield (
-                f"    instructions of a tick: {one.largest} at most, {min(one.instructions)} at least; "
-                f"{one.stack} bytes of stack"
-            )
-        bound = f"{one.bound} instructions" if one.bound is not None else f"none: {one.unbounded}"
-        yield f"    bound for any data: {bound}"
-    for line in measured.missing:
-        yield f"  {line}"
-    if measured.float_error:
-        yield "  largest difference between float and double, with this signal:"
-        for name, value in measured.float_error.items():
-            yield f"    {name:<20}{value:.3g}"

@@ -22,7 +22,8 @@ from ...blocks.core import CompilerError, OptionError, explain_calls, near
 from ..platform import cache_folder, native_platform
 from ..toolchain import SUFFIXES
 from .compiler import compile_shared, describe_compiler, find_compiler, run_compiler
-from .target_code import Member, TargetText
+from .target_members import Member
+from .target_text import TargetText
 
 PROCESSORS = {
     "cortex-m4": ("thumb-freestanding-eabihf", "cortex_m4+vfp4d16sp"),
@@ -97,6 +98,29 @@ class ProcessorMeasurement:
     def largest(self) -> int | None:
         """The largest number of instructions of a tick."""
         return max(self.instructions, default=None)
+
+
+@explain_calls
+@dataclass(frozen=True, eq=False)
+class TargetMeasurement:
+    """C for a target, measured with a test signal.
+
+    Attributes
+    ----------
+    ticks : int
+        Ticks of the test signal.
+    processors : tuple of ProcessorMeasurement
+        By processor: memory, stack and instructions.
+    float_error : mapping of str to float
+        By output and signal: the largest difference between single and double precision; empty in double precision.
+    missing : tuple of str
+        What could not be measured, and why.
+    """
+
+    ticks: int
+    processors: tuple[ProcessorMeasurement, ...]
+    float_error: Mapping[str, float]
+    missing: tuple[str, ...]
 
 
 def measure(text: TargetText, processor: str, inputs: Mapping[str, Any], ticks: int) -> ProcessorMeasurement:
@@ -176,7 +200,8 @@ def input_rows(text: TargetText, inputs: Mapping[str, Any], ticks: int) -> dict[
 
 def offsets(text: TargetText) -> dict[tuple[str, str], int]:
     """Return the places of members in the struct, in bytes, by group and name."""
-    size, end, found = 4 if text.number == "float" else 8, 0, {}
+    size, end = 4 if text.number == "float" else 8, 0
+    found: dict[tuple[str, str], int] = {}
     for member in text.members:
         found[member.group, member.variable.name] = end
         end += size * member.count
@@ -447,4 +472,4 @@ def _load(sources: Mapping[str, str], compiled: Sequence[str]) -> ctypes.CDLL:
 
 
 def _entries(members: Iterable[Member]) -> list[str]:
-    return [m.access(i).replace("c->", "c.") for m in members for i in range(m.count)]
+    return [m.access(i, "c.") for m in members for i in range(m.count)]

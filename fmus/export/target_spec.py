@@ -14,7 +14,7 @@ import numpy as np
 
 from .loop_spec import LoopSpec
 from .model_spec import Variable
-from .scalar_code import Lookup
+from .scalar_operations import Lookup
 
 CLOCK_LIMIT = 32
 """Clocks of a target: their bits are in one word."""
@@ -94,3 +94,25 @@ class TargetSpec:
     acting: tuple[tuple[str, ...], ...]
     numbers: tuple[TargetNumbers, ...] = ()
     fixed: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def counts_clocks(self) -> bool:
+        """Whether a tick has to find out which clocks act; without it, the only one acts at each."""
+        return self.loop.clocks != ((1, 0),)
+
+    def describe_clock(self, clock: int) -> str:
+        """Return in words when a clock acts."""
+        every, offset = self.loop.clocks[clock]
+        text = f"every {float(every * self.loop.base):g} s"
+        return f"{text} from {float(offset * self.loop.base):g} s on" if offset else text
+
+    def describe_clocks(self, acting: int) -> str:
+        """Return in words when a set of clocks, as bits, acts together."""
+        return " with ".join(self.describe_clock(i) for i in self._clocks_of(acting)) or "at no clock"
+
+    def acting_at(self, acting: int) -> tuple[str, ...]:
+        """Return the names of the subsystems that act with a set of clocks."""
+        return tuple(path or "the diagram" for i in self._clocks_of(acting) for path in self.acting[i])
+
+    def _clocks_of(self, acting: int) -> list[int]:
+        return [i for i in range(len(self.loop.clocks)) if acting >> i & 1]

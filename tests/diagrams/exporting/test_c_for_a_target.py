@@ -355,7 +355,7 @@ def test_with_the_loop_of_runs_it_has_the_bits_of_rk4(make, tmp_path):
     prefix = code.name.upper()
     gets = "".join(
         f'{code.name}_get(&c, {prefix}_OUTPUT_{name.upper().replace(".", "_")}, 0u, &value); printf("%.17g ", value);'
-        for name in (one.variable.name for one in code._loop.outputs)
+        for name in (one.variable.name for one in code._spec.outputs)
     )
     (tmp_path / "main.c").write_text(_COPIED.format(name=code.name, upper=prefix, sets="", gets=gets))
     warnings = ["-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
@@ -363,8 +363,8 @@ def test_with_the_loop_of_runs_it_has_the_bits_of_rk4(make, tmp_path):
     subprocess.run(command, cwd=tmp_path, check=True)
     said = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
     found = np.array([line.split() for line in said.splitlines()], dtype=float)
-    for i, name in enumerate(one.variable.name for one in code._loop.outputs):
-        sampled = code._loop.outputs[i].sampled
+    for i, name in enumerate(one.variable.name for one in code._spec.outputs):
+        sampled = code._spec.outputs[i].sampled
         expected = run[name][:60] if sampled else run[name][1:]
         # Newton's method begins with the last solution, and the loop evaluates at the end of each period, too
         np.testing.assert_allclose(found[:, i], expected, rtol=0.0, atol=4e-16 if make is solved else 0.0)

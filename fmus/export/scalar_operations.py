@@ -1,14 +1,9 @@
-"""Scalar operations of CasADi's functions as C that people read: named values, short expressions, few temporaries.
-
-CasADi writes one operation a line in variables without names. Here an operation that one other needs is written inside
-it, and a value has the name of the signal that it is. Every operation is the one that CasADi has, in the same grouping,
-so that all bits are the same as long as the compiler contracts nothing.
-"""
+"""Scalar operations of CasADi's functions, read, and computed where they are constant, to the same bits."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,28 +11,8 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import DefinitionError
-from ...blocks.tracing import MATH_FUNCTIONS
 
-OF_TIME = "_of_time"
-"""End of names in double precision, where numbers are of single precision."""
-_WIDEST = 84
-"""Characters of an expression up to which it is written inside another one."""
-_ATOM, _UNARY, _PRODUCT, _SUM, _RELATION, _LOGIC = 6, 5, 4, 3, 2, 1
-_BINARY = {
-    ca.OP_ADD: ("+", _SUM),
-    ca.OP_SUB: ("-", _SUM),
-    ca.OP_MUL: ("*", _PRODUCT),
-    ca.OP_DIV: ("/", _PRODUCT),
-    ca.OP_LT: ("<", _RELATION),
-    ca.OP_LE: ("<=", _RELATION),
-    ca.OP_EQ: ("==", _RELATION),
-    ca.OP_NE: ("!=", _RELATION),
-    ca.OP_AND: ("&&", _LOGIC),
-    ca.OP_OR: ("||", _LOGIC),
-}
 _BOOLEAN = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT}
-OF_MATH = frozenset(MATH_FUNCTIONS.values())
-"""Functions of math.h that are written."""
 FIND, TAKE = -1, -2
 """Operations of tables: the place of a value between breakpoints, and an entry of a table."""
 CHOOSE = -3
@@ -326,14 +301,7 @@ class Tables:
 
     def __init__(self) -> None:
         self.values: list[np.ndarray] = []
-        self.read: set[tuple[int, bool]] = set()
-        self.sought: set[tuple[int, bool]] = set()
         self._known: dict[bytes, int] = {}
-
-    def name(self, number: int, fine: bool) -> str:
-        """Return the C name of a table, as numbers or in double precision, and note that it is read."""
-        self.read.add((number, fine))
-        return f"table_{number}{OF_TIME * fine}"
 
     def add(self, lookup: Lookup) -> int:
         """Return the number of a lookup's table."""
@@ -342,194 +310,3 @@ class Tables:
             self._known[key] = len(self.values)
             self.values.append(lookup.table)
         return self._known[key]
-
-
-class Expressions:
-    """C text of values: written inside others, or assigned to variables.
-
-    ``read``: returns the C text of an input, by argument, entry, and whether it is wanted in double precision.
-    ``call``: returns the C name of a function of math.h, by its name and whether it is that of double precision.
-    ``single``: whether numbers are of single precision. Values that follow from the time and parameters alone are of
-    double precision nevertheless: a float of the time is as coarse as a tick after some hours.
-    ``timed``: whether argument 0 is the time, 1 states, 2 inputs and 3 parameters.
-    """
-
-    def __init__(
-        self,
-        scalars: Scalars,
-        uses: Mapping[int, int],
-        read: Callable[[int, int, bool], str],
-        *,
-        tables: Tables,
-        call: Callable[[str, bool], str],
-        real: str,
-        single: bool,
-        timed: bool = True,
-    ):
-        self._scalars, self._uses, self._read = scalars, uses, read
-        self._tables, self._call, self._real, self._single = tables, call, real, single
-        self._texts: dict[int, tuple[str, int]] = {}
-        self._done: set[int] = set()
-        self._temporaries = 0
-        self.functions: set[str] = set()
-        self.fine_functions: set[str] = set()
-        self._fine = scalars.of_time(uses) if single and timed else frozenset()
-        self.operations: Counter[str] = Counter()
-
-    def compute(self, node: int, name: str | None = None) -> list[str]:
-        """Return the statements that compute a value, into a constant of this name where one is given."""
-        lines: list[str] = []
-        for one in self._scalars.before(node, self._done):
-            text, level = self._write(one)
-            plain = self._scalars.nodes[one].operation in (ca.OP_INPUT, ca.OP_CONST)
-            chosen = "?" in text  # nested choices are hard to read
-            wanted = name if one == node and not plain else None
-            if wanted is None and (
-                plain or (self._uses.get(one, 0) < 2 and len(text) <= _WIDEST and one != node and not chosen)
-            ):
-                self._texts[one] = text, level
-                continue
-            if wanted is None:
-                self._temporaries += 1
-                wanted = f"t{self._temporaries}"
-            kind = "bool" if self._scalars.nodes[one].is_boolean else "double" if one in self._fine else self._real
-            lines.append(f"const {kind} {wanted} = {text};")
-            self._texts[one] = wanted, _ATOM
-        return lines
-
-    def text(self, node: int) -> str:
-        """Return the C text of a value that has been computed, as a number."""
-        return self._number(node, _LOGIC)
-
-    def _number(self, node: int, level: int, fine: bool = False) -> str:
-        """Return the C text of a value as a number, for an operation of some level, in double precision or not."""
-        text, own = self._texts[node]
-        one = self._scalars.nodes[node]
-        if one.is_boolean:
-            inner = text if own >= _ATOM else f"({text})"
-            return f"({inner} ? {self.constant(1.0, fine)} : {self.constant(0.0, fine)})"
-        if fine and node not in self._fine:  # a constant or a parameter
-            text, own = self._leaf(one, fine)
-        if node in self._fine and not fine:
-            text, own = f"({self._real}){text if own >= _UNARY else f'({text})'}", _UNARY
-        return text if own >= level else f"({text})"
-
-    def _leaf(self, one: ScalarNode, fine: bool) -> tuple[str, int]:
-        if one.operation == ca.OP_INPUT:
-            return self._read(*one.place, fine), _UNARY if fine and one.place[0] else _ATOM
-        text = self.constant(one.constant, fine)
-        return text, _UNARY if text.startswith("-") else _ATOM
-
-    def _truth(self, node: int, level: int) -> str:
-        text, own = self._texts[node]
-        if not self._scalars.nodes[node].is_boolean:
-            zero = self.constant(0.0, node in self._fine)
-            text, own = f"{text if own > _RELATION else f'({text})'} != {zero}", _RELATION
-        return text if own >= level else f"({text})"
-
-    def is_positive(self, node: int) -> bool:
-        """Whether a value is a positive constant."""
-        one = self._scalars.nodes[node]
-        return one.operation == ca.OP_CONST and one.constant > 0.0
-
-    def constant(self, value: float, fine: bool = False) -> str:
-        """Return a number as C text, in double precision or not."""
-        return c_constant(value, single=self._single and not fine)
-
-    def _write(self, number: int) -> tuple[str, int]:
-        node = self._scalars.nodes[number]
-        operation, arguments = node.operation, node.arguments
-        fine = number in self._fine
-        if operation in (ca.OP_INPUT, ca.OP_CONST):
-            return self._leaf(node, fine)
-        self.operations[_kind(operation)] += 1
-        # Each branch returns the text with the precedence of its outermost operator, so that no needless brackets are
-        # written.
-        if operation in _BINARY:
-            return self._binary(operation, arguments, fine)
-        if operation == FIND:
-            self._note("find", fine)
-            self._tables.sought.add((node.place[0], fine))
-            table = self._tables.name(node.place[0], fine)
-            return f"find_in_{table}({self._number(arguments[0], _LOGIC, fine)})", _ATOM
-        if operation == TAKE:
-            self._note("take", fine)
-            table = self._tables.name(node.place[0], fine)
-            return f"{table}[(size_t)({self._number(arguments[0], _LOGIC, fine)})]", _ATOM
-        if operation == ca.OP_NOT:
-            return f"!{self._truth(arguments[0], _ATOM)}", _UNARY
-        if operation == ca.OP_NEG:
-            inner = self._number(arguments[0], _ATOM, fine)
-            return f"-{inner}", _UNARY
-        if operation == ca.OP_SQ:
-            inner = self._number(arguments[0], _ATOM, fine)
-            return f"{inner} * {inner}", _PRODUCT
-        if operation == ca.OP_TWICE:
-            return f"{self.constant(2.0, fine)} * {self._number(arguments[0], _UNARY, fine)}", _PRODUCT
-        if operation == ca.OP_INV:
-            return f"{self.constant(1.0, fine)} / {self._number(arguments[0], _UNARY, fine)}", _PRODUCT
-        if operation == ca.OP_IF_ELSE_ZERO:
-            condition = self._truth(arguments[0], _ATOM)
-            return f"({condition} ? {self._number(arguments[1], _SUM, fine)} : {self.constant(0.0, fine)})", _ATOM
-        if operation == CHOOSE:
-            self._note("choose", fine)
-            condition = self._truth(arguments[0], _LOGIC)
-            one, other = (self._number(argument, _LOGIC, fine) for argument in arguments[1:])
-            return f"choose{OF_TIME * fine}({condition}, {one}, {other})", _ATOM
-        if operation == ca.OP_SIGN:
-            self._note("sign", fine)
-            return f"sign_of{OF_TIME * fine}({self._number(arguments[0], _LOGIC, fine)})", _ATOM
-        if operation in (ca.OP_ASSIGN, ca.OP_LIFT):
-            return self._number(arguments[0], _ATOM, fine), _ATOM
-        if operation not in MATH_FUNCTIONS:
-            raise DefinitionError(
-                f"found CasADi's operation {operation}, which is not written as C. Write the equation with sums, "
-                "products, elementary functions and comparisons."
-            )
-        called = MATH_FUNCTIONS[operation]
-        self._note(called, fine)
-        listed = ", ".join(self._number(argument, _LOGIC, fine) for argument in arguments)
-        return f"{self._call(called, fine)}({listed})", _ATOM
-
-    def _note(self, function: str, fine: bool) -> None:
-        (self.fine_functions if fine else self.functions).add(function)
-
-    def _binary(self, operation: int, arguments: tuple[int, ...], fine: bool) -> tuple[str, int]:
-        sign, level = _BINARY[operation]
-        if operation in (ca.OP_AND, ca.OP_OR):
-            left, right = (self._truth(argument, _RELATION) for argument in arguments)
-            return f"{left} {sign} {right}", level
-        above = level + 1
-        left = self._number(arguments[0], above if level == _RELATION else level, fine)
-        right = self._number(arguments[1], above, fine)
-        return f"{left} {sign} {right}", level
-
-
-def _kind(operation: int) -> str:
-    """Return what an operation counts as in a report."""
-    if operation in (ca.OP_ADD, ca.OP_SUB, ca.OP_NEG):
-        return "+ -"
-    if operation in (ca.OP_MUL, ca.OP_SQ, ca.OP_TWICE):
-        return "*"
-    if operation in (ca.OP_DIV, ca.OP_INV):
-        return "/"
-    if operation in (FIND, TAKE):
-        return "tables"
-    if operation in MATH_FUNCTIONS:
-        return MATH_FUNCTIONS[operation]
-    return "comparisons"
-
-
-def c_constant(value: float, *, single: bool = False) -> str:
-    """Return a number as C text of double or single precision, exactly, or rounded to the nearest."""
-    with np.errstate(over="ignore", under="ignore"):
-        number: Any = np.float32(value) if single else np.float64(value)
-    if np.isnan(number):
-        return "NAN" if single else "(double)NAN"
-    if np.isinf(number):
-        sign = "" if number > 0 else "-"
-        return f"{sign}INFINITY" if single else f"{sign}(double)INFINITY"
-    usual = not number or 1e-5 < abs(number) < 1e7
-    write = np.format_float_positional if usual else np.format_float_scientific
-    text = write(number, unique=True, trim="0")
-    return f"{text}f" if single else text
