@@ -19,9 +19,12 @@ from ..core import (
     Kind,
     Output,
     ParameterError,
+    PortUnit,
     ShapeError,
     State,
+    Units,
     accepts,
+    agreed_unit,
     kinds,
     parameter,
     shape_of,
@@ -153,6 +156,11 @@ class StateFeedback(Block):
                 port="state",
             )
         return u.feedforward - (K @ off if rows else K * off)
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Refuse a target in other units than the state; the gain, which has none, hides that of y."""
+        agreed_unit(units, "state", "target")
+        return {}
 
 
 class _Observer(Block):

@@ -20,13 +20,11 @@ from ..core import (
     Output,
     PortUnit,
     State,
-    UnitError,
     Units,
+    agreed_unit,
     check_shapes,
-    describe_mismatch,
     kinds,
     parameter,
-    same_unit,
 )
 from .branching import NumberedInputs, check_fits, expect_scalar, truth
 from .initial_values import StartsAtInput
@@ -203,11 +201,7 @@ class Switch(Block):
 
     def output_units(self, units: Units) -> Mapping[str, PortUnit]:
         """Return the unit that both branches have."""
-        then, other = units["then"], units["otherwise"]
-        if isinstance(then, str) and isinstance(other, str) and not same_unit(then, other):
-            step = describe_mismatch(other, then)
-            raise UnitError(f"expected {then} as `then` next to it is: {step}", port="otherwise")
-        return {"y": other if then is None else then}
+        return {"y": agreed_unit(units, "then", "otherwise")}
 
     def indicators(self, t: Array, x: Any, u: Any) -> Array:
         """Return the distance of the condition above 0.5."""

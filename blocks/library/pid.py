@@ -7,7 +7,21 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ..core import Array, Block, Event, Input, Output, ParameterError, State, clip, kinds, parameter
+from ..core import (
+    Array,
+    Block,
+    Event,
+    Input,
+    Output,
+    ParameterError,
+    PortUnit,
+    State,
+    Units,
+    agreed_unit,
+    clip,
+    kinds,
+    parameter,
+)
 from ..tracing import find_hold, is_nonzero
 from .integrators import check_limits
 
@@ -157,6 +171,11 @@ class PID(Block):
         if self.tracks and self.tracking_time is None and self.ki and not self.kp / self.ki > 0:
             text = f"kp / ki is {self.kp / self.ki:g} s; expected a positive time. Give tracking_time."
             raise ParameterError(text, port="tracking_time")
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Refuse a set-point in another unit than the measured value; the gains, which have none, hide that of u."""
+        agreed_unit(units, "r", "y")
+        return {}
 
     @property
     def has_limits(self) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
+    PID,
     Block,
     Constant,
     DoubleDriveError,
@@ -20,6 +21,7 @@ from loopwright.blocks import (
     ShapeError,
     Sine,
     State,
+    StateFeedback,
     Step,
     Sum,
     TraceError,
@@ -225,6 +227,26 @@ def test_another_scale_of_the_same_unit_says_the_factor():
 def test_a_sum_of_different_units():
     with pytest.raises(UnitError, match=r"^sum\.u2: b\.y is in m; a\.y next to it is in N"):
         Diagram("d", Sum()(Constant(value=1, unit="N", name="a"), Constant(value=1, unit="m", name="b")))
+
+
+def test_a_set_point_in_another_unit_than_the_measured_value():
+    """kp (r − y) of radians less degrees is a number, and a wrong one: the gain, which has no unit, can't show it."""
+    measured, wish = Constant(value=1.0, unit="rad", name="measured"), Constant(value=30.0, unit="deg", name="wish")
+    pid = PID(kp=1.0, name="pid")
+    text = r"^pid\.y: measured\.y is in rad; expected deg as `r` next to it is: .*put Gain\(gain=57\.295"
+    with pytest.raises(UnitError, match=text):
+        Diagram("d", pid(wish, measured))
+    Diagram("d", pid(Constant(value=0.5, unit="rad"), measured))
+    Diagram("d", pid(0.5, measured))  # a plain number has no unit
+
+
+def test_a_target_in_other_units_than_the_state():
+    state, target = Constant(value=(1.0, 2.0), unit="m", name="at"), Constant(value=(30.0, 0.0), unit="mm", name="wish")
+    feedback = StateFeedback(gain=(1.0, 2.0), name="feedback")
+    text = r"^feedback\.target: wish\.y is in mm; expected m as `state` next to it is: .*Gain\(gain=0\.001\)"
+    with pytest.raises(UnitError, match=text):
+        Diagram("d", feedback(state, target))
+    Diagram("d", feedback(state, (0.0, 0.0)))
 
 
 def test_a_unit_travels_through_blocks_that_keep_it():
