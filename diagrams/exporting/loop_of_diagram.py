@@ -339,13 +339,10 @@ class _Variables:
         """Return the entries of the log that a wire takes."""
         full = join(wire.block, wire.port)
         layout = self._flat.plant_outputs if full in self._flat.plant_outputs.slices else self._flat.log
-        where, shape = layout.slices[full], layout.shapes[full]
-        entries = np.arange(where.start, where.stop).reshape(shape)
-        return tuple(np.ravel(entries if wire.index is None else entries[wire.index]).tolist())
+        return tuple(np.ravel(layout.slices[full].start + wire.entries(layout.shapes[full])).tolist())
 
     def _shape(self, wire: Wire) -> tuple[int, ...]:
-        shape = self._flat.log.shapes[join(wire.block, wire.port)]
-        return shape if wire.index is None else np.empty(shape)[wire.index].shape
+        return wire.entries(self._flat.log.shapes[join(wire.block, wire.port)]).shape
 
     def inputs(self) -> tuple[Placed, ...]:
         """Return the inputs."""

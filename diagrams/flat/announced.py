@@ -91,7 +91,7 @@ def _line_at(flat: FlatDiagram, path: str, port: str, known: Lines) -> Line | No
         return None
     if wire.index is None:
         return line
-    index = np.ravel(np.arange(size(shape)).reshape(shape)[wire.index])
+    index = np.ravel(wire.entries(shape))
     return line[0][index], line[1][index]
 
 

@@ -195,7 +195,7 @@ class Instant:
         if wire.index is None:
             return column
         shape = self.layout.log.shapes[join(wire.block, wire.port)]
-        index = np.ravel(np.arange(size(shape)).reshape(shape)[wire.index])
+        index = np.ravel(wire.entries(shape))
         return column[index.tolist()] if not isinstance(column, np.ndarray) else column[index]
 
     def _is_made(self, path: str, port: str) -> bool:

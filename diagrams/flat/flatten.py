@@ -135,8 +135,7 @@ def _input_shape(table: Structure, checked: Checked, path: str, port: str) -> Sh
     if declared is not None:
         return declared
     wire = table.wires[path, port]
-    shape = checked.shapes[wire.block, wire.port]
-    return shape if wire.index is None else np.empty(shape)[wire.index].shape
+    return wire.entries(checked.shapes[wire.block, wire.port]).shape
 
 
 def _continuous(checked: Checked, table: Structure, states: StateLayout) -> np.ndarray:

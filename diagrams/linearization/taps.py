@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...blocks.core import UnknownNameError, elements, near
-from ...blocks.tracing import size
 from ..flat import FlatDiagram
 from ..results import resolve
 from ..wiring import Wire, explain_absent_state, index_of, split_entry
@@ -26,9 +25,7 @@ class Tap:
 
 def wire_entries(flat: FlatDiagram, wire: Wire) -> tuple[int, ...]:
     """Return the numbers of the entries of a port that a wire takes."""
-    shape = flat.checked.shapes[wire.block, wire.port]
-    every = np.arange(size(shape)).reshape(shape)
-    return tuple(np.ravel(every if wire.index is None else every[wire.index]).tolist())
+    return tuple(np.ravel(wire.entries(flat.checked.shapes[wire.block, wire.port])).tolist())
 
 
 def find_signal(flat: FlatDiagram, name: str) -> Tap:
@@ -47,9 +44,7 @@ def find_signal(flat: FlatDiagram, name: str) -> Tap:
         step = f"{reason[0].upper()}{reason[1:]}" if reason else near(name, known)
         raise UnknownNameError(f"there is no signal {name!r} in this diagram. {step}") from None
     wire = wires[full] if full in wires else Wire(*flat.ports[full])
-    shape = flat.checked.shapes[wire.block, wire.port]
-    index = np.arange(size(shape)).reshape(shape)
-    part = index if wire.index is None else np.asarray(index[wire.index])
+    part = wire.entries(flat.checked.shapes[wire.block, wire.port])
     labels = np.array(elements(name if name in wires else full, part.shape)).reshape(part.shape)
     if entry:
         index_of_entry = index_of(entry, part.shape, full)

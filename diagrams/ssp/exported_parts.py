@@ -177,8 +177,7 @@ def find_export(wired: WiredDiagram, path: str) -> Export:
         if wire.block == opened.outside:  # a signal that only passes through: its readers have its source
             continue
         full = wired.checked.shapes[wire.block, wire.port]
-        entries = np.arange(int(np.prod(full))).reshape(full)
-        picked = entries if wire.index is None else entries[wire.index]
+        picked = wire.entries(full)
         if wire.index is None:
             outputs[wire.block, wire.port, None] = name, None
         for i, entry in enumerate(np.ravel(picked)):

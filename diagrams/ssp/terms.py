@@ -54,8 +54,7 @@ class Terms:
 
     def shape(self, wire: Wire) -> tuple[int, ...]:
         """Return the shape of a wire."""
-        shape = self.wired.checked.shapes[wire.block, wire.port]
-        return shape if wire.index is None else tuple(np.empty(shape)[wire.index].shape)
+        return wire.entries(self.wired.checked.shapes[wire.block, wire.port]).shape
 
     def entries(self, wire: Wire) -> list[Term]:
         """Return the terms of a wire's entries, in order; one of a scalar."""
@@ -68,8 +67,7 @@ class Terms:
         """Return the term of one entry of a wire."""
         full = self.wired.checked.shapes[wire.block, wire.port]
         if wire.index is not None:
-            picked = np.ravel(np.arange(int(np.prod(full))).reshape(full)[wire.index])
-            i = int(picked[i or 0])
+            i = int(np.ravel(wire.entries(full))[i or 0])
         return self._of_port(wire.block, wire.port, i if full else None)
 
     def _of_port(self, path: str, port: str, i: int | None) -> Term:

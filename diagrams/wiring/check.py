@@ -55,7 +55,7 @@ def part_shape(shape: Shape, wire: Wire, consumer: str, port: str) -> Shape:
             f"found {wire}, a part of a scalar; wire the whole of {wire.block}.{wire.port}.", block=consumer, port=port
         )
     try:
-        return np.empty(shape)[wire.index].shape
+        return wire.entries(shape).shape
     except IndexError:
         raise ShapeError(
             f"{wire} is out of range, counted from 1: the port has shape {shape}. Index within it, in Python from 0.",

@@ -112,6 +112,4 @@ class EntryOrder:
 
     def _entries(self, wire: Wire) -> Any:
         """Return the entries of its port that a wire takes, in their order."""
-        shape = self.traced[wire.block].outputs[wire.port]
-        index = np.arange(size(shape)).reshape(shape)
-        return np.ravel(index if wire.index is None else index[wire.index])
+        return np.ravel(wire.entries(self.traced[wire.block].outputs[wire.port]))

@@ -6,11 +6,14 @@ Wires lead from block to block, across the borders of subsystems.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from fractions import Fraction
 
-from ...blocks.core import Block, Grid, Sheet, ShownAsTable, brief, explain_calls
+import numpy as np
+
+from ...blocks.core import Block, Grid, Shape, Sheet, ShownAsTable, brief, explain_calls
 
 
 @explain_calls
@@ -92,6 +95,14 @@ class Wire:
             start, stop = self.index.start or 0, self.index.stop
             return f"[{start + (start >= 0)}:{'' if stop is None else stop if stop >= 0 else stop - 1}]"
         return "" if self.index is None else f"[{self.index + (self.index >= 0)}]"
+
+    def entries(self, shape: Shape) -> np.ndarray:
+        """Return the numbers of the entries of a port of some shape that it carries, in the shape of what it carries.
+
+        Raises `IndexError` if the port hasn't as many.
+        """
+        every = np.arange(math.prod(shape)).reshape(shape)
+        return every if self.index is None else np.asarray(every[self.index])
 
 
 @dataclass
