@@ -2,12 +2,13 @@
 
 from .memory import machine_memory
 from .operating_point import FreeDirection, OperatingPoint, PointOrigin, units_of
+from .recorded_signals import RecordedSignals
 from .recorded_texts import TextSignal
-from .recorder import Recorder, select
+from .recorder import Recorder
 from .recording import Recording
 from .run import Run, Snapshot
 from .saved_state import RunState, check_fits, layout_of, not_open_error
-from .signal_names import Places, entries, outputs_of, resolve
+from .signal_names import resolve
 from .step_info import StepInfo
 from .step_measures import ExpectedStep, is_at_rest, measure_step
 from .stored import Occurrence, Stopped
@@ -17,8 +18,8 @@ __all__ = [
     "FreeDirection",
     "Occurrence",
     "OperatingPoint",
-    "Places",
     "PointOrigin",
+    "RecordedSignals",
     "Recorder",
     "Recording",
     "Run",
@@ -28,14 +29,11 @@ __all__ = [
     "Stopped",
     "TextSignal",
     "check_fits",
-    "entries",
     "is_at_rest",
     "layout_of",
     "machine_memory",
     "measure_step",
     "not_open_error",
-    "outputs_of",
     "resolve",
-    "select",
     "units_of",
 ]

@@ -7,22 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from io import FileIO
 from pathlib import Path
 from time import monotonic
-from typing import Any, TextIO
+from typing import TextIO
 
 import numpy as np
 
-from ...blocks.core import (
-    Layout,
-    SimulationError,
-    UnknownNameError,
-    check_argument,
-    describe_disk_error,
-    enumerate_some,
-    kinds,
-)
-from ..wiring import Wire
+from ...blocks.core import SimulationError, check_argument, describe_disk_error, enumerate_some, kinds
 from .memory import machine_memory
-from .signal_names import entries, find_blocks, resolve
 from .stored import END, OTHER_PATH, Occurrence, PathLike, create, event_line, prepare, read, split, write_json
 
 _FIRST, _LARGEST = 1024, 2**26  # rows of the first chunk in memory, bytes of the largest
@@ -301,39 +291,3 @@ class Recorder:
         stored = read(self.to)
         self.events, self.residual = stored.events, stored.residual
         return stored.t, stored.data
-
-
-def select(
-    record: Iterable[str] | None,
-    layout: Layout,
-    wires: Mapping[str, Wire],
-    width: int,
-    *,
-    states: bool = True,
-    blocks: Mapping[str, Any] | None = None,
-) -> np.ndarray | None:
-    """Return the entries of a sample's vector that a selection keeps, ascending; None for all.
-
-    A name is one that ``run[name]`` takes, or a subsystem or block for all its signals; ``record`` None keeps all. The
-    vector has the ports of ``layout``, then the states up to ``width``. ``blocks`` are for errors; see `resolve`.
-    """
-    if record is None:
-        return None if states else np.arange(layout.total)
-    if isinstance(record, str):
-        record = (record,)
-    kept: set[int] = set()
-    for name in record:
-        whole = find_blocks(name, blocks or {}) if isinstance(name, str) else []
-        within = f"{whole[0]}." if len(whole) == 1 else f"{name}."
-        inside = [where for port, where in layout.slices.items() if port.startswith(within)]
-        try:
-            full = resolve(name, wires, layout.slices, None if inside else blocks)
-            kept.update(entries(full, layout, wires).ravel().tolist())
-        except UnknownNameError:
-            if not inside:
-                raise
-            for where in inside:
-                kept.update(range(where.start, where.stop))
-    if states:
-        kept.update(range(layout.total, width))
-    return np.array(sorted(kept), dtype=int)

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
-from ...blocks.core import OptionError, PortUnit, accepts
+from ...blocks.core import Block, OptionError, accepts
 from ..flat import FlatDiagram
-from ..wiring import join
 from .memory import check_memory
-from .recorder import EVERY, Recorder, select
-from .signal_names import outputs_of
+from .recorded_signals import RecordedSignals
+from .recorder import EVERY, Recorder
 from .stored import PathLike, header
 
 
@@ -25,6 +22,8 @@ class Recording:
 
     flat: FlatDiagram
     name: str
+    blocks: Mapping[str, Block]
+    """The diagram's blocks, as they were wired."""
     record: Iterable[str] | None
     every: int
     states: bool
@@ -47,25 +46,15 @@ class Recording:
         """Let the next recorder replace the run on disk."""
         self.overwrite = True
 
-    @property
-    def width(self) -> int:
-        """Entries of the vector of a sample, without the residual."""
-        return self.flat.log.total + self.flat.width
-
     @cached_property
-    def columns(self) -> np.ndarray | None:
-        """The entries that are kept; None for all."""
-        flat = self.flat
-        return select(self.record, flat.log, flat.table.names, self.width, states=self.states, blocks=flat.table.blocks)
-
-    @cached_property
-    def units(self) -> dict[str, PortUnit]:
-        """The units of the ports by path."""
-        return {join(*port): unit for port, unit in self.flat.checked.units.items()}
+    def signals(self) -> RecordedSignals:
+        """The signals that are recorded."""
+        return RecordedSignals.of(self.flat, self.blocks).choose(self.record, states=self.states)
 
     def check_memory(self, ticks: int, *, every_tick: bool) -> None:
         """Refuse a run whose samples can't fit: at every tick, or at those at which a subsystem acts."""
-        width = self.width if self.columns is None else len(self.columns)
+        columns = self.signals.columns
+        width = self.signals.width if columns is None else len(columns)
         clocks = self.flat.distinct
         samples = ticks + 1
         if clocks and not every_tick:
@@ -74,29 +63,16 @@ class Recording:
 
     def begin(self, rows: int | None = None) -> Recorder:
         """Return a recorder that has no sample yet; ``rows`` are the samples to come, if that is known."""
-        flat, head = self.flat, None
-        residual = bool(flat.loops.slices)
-        if self.to is not None:
-            head = header(
-                diagram=self.name,
-                layout=flat.log,
-                wires=flat.table.names,
-                units=self.units,
-                width=self.width,
-                columns=self.columns,
-                has_states=self.states,
-                residual=residual,
-                outputs=outputs_of(flat.table.blocks),
-            )
+        residual = bool(self.flat.loops.slices)
         recorder = Recorder(
-            self.width,
-            self.columns,
+            self.signals.width,
+            self.signals.columns,
             every=self.every,
             rows=rows,
             residual=residual,
             to=self.to,
-            header=head,
+            header=None if self.to is None else header(self.name, self.signals, residual=residual),
             overwrite=self.overwrite,
         )
-        recorder.watch(flat.unread)
+        recorder.watch(self.flat.unread)
         return recorder

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -13,10 +12,8 @@ import numpy as np
 from ...blocks.core import (
     Layout,
     OptionError,
-    PortUnit,
     Sheet,
     ShownAsTable,
-    UnknownNameError,
     accepts,
     brief,
     check_argument,
@@ -30,8 +27,9 @@ from ...blocks.core import (
 )
 from ..wiring import Wire, index_of, split_entry
 from .measured_signals import Data, MeasuredSignals, split_measured
+from .recorded_signals import RecordedSignals
 from .recorded_texts import TextSignal
-from .signal_names import BlockOutputs, Place, Places, entries, outputs_of, place_of, resolve
+from .signal_names import resolve
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 
 if TYPE_CHECKING:
@@ -87,9 +85,8 @@ class Snapshot:
         return brief(f"instant t = {self.t:.9g} s{of}", *facts, then="instant['name'], diagram.linearize(instant)")
 
     def __getitem__(self, name: str) -> Any:
-        diagram = None if self.run is None else self.run.diagram
-        outputs = None if self.run is None else self.run.outputs
-        full = resolve(name, self.names, self.values, getattr(diagram, "blocks", None), outputs)
+        more = () if self.run is None else (self.run.signals.blocks, self.run.signals.stored_outputs)
+        full = resolve(name, self.names, self.values, *more)
         full, entry = split_entry(full, self.values)
         value = self.values[full]
         return value[index_of(entry, value.shape, full)] if entry else value
@@ -140,9 +137,8 @@ class Run(ShownAsTable):
 
     t: np.ndarray
     data: np.ndarray = field(repr=False)
-    layout: Layout = field(repr=False)
-    wires: dict[str, Wire] = field(repr=False)
-    units: dict[str, PortUnit] = field(repr=False)
+    signals: RecordedSignals = field(repr=False)
+    """The names, columns and units of what was recorded."""
     diagram: Any = field(repr=False)
     elapsed: float = float("nan")
     tier: str = "interpreted"
@@ -151,17 +147,11 @@ class Run(ShownAsTable):
     events: Sequence[Occurrence] = field(default=(), repr=False)
     stopped: Stopped | None = None
     residual: np.ndarray | None = field(default=None, repr=False)
-    columns: np.ndarray | None = field(default=None, repr=False)
-    """Entries of a sample's vector (outputs as in ``layout``, then states) that ``data`` holds; None for all."""
-    has_states: bool = field(default=True, repr=False)
     diagram_name: str = ""
     final_state: RunState | None = field(default=None, repr=False)
     """The complete state at the end, for ``simulate(…, start=)``; None where an FMU can't save its state."""
     recipe: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Options of the run (step, solver, tolerances, start), with which an instant of it can be found again."""
-    outputs: BlockOutputs | None = field(default=None, repr=False)
-    """Outputs by their blocks' paths, secondary ones aside, where there is no diagram that has them."""
-    _places: Places = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if not self.diagram_name:
@@ -170,8 +160,7 @@ class Run(ShownAsTable):
     if not TYPE_CHECKING:  # a type checker knows all members
 
         def __getattr__(self, name):
-            built = vars(self).keys() >= {"layout", "wires", "diagram", "outputs", "columns", "_places"}
-            is_signal = built and not name.startswith("_") and name in self
+            is_signal = "signals" in vars(self) and not name.startswith("_") and name in self
             raise missing_member(self, name, "a run", WAYS | ({name: f'run["{name}"]'} if is_signal else {}))
 
     def __repr__(self) -> str:
@@ -199,7 +188,7 @@ class Run(ShownAsTable):
         named = [name for name in self.wires if name in names]
         plants = self._plant_outputs() if named and len(named) < _FEW else []
         shown = [*named, *plants[: _FEW - len(named)]] or [name for name in names if name not in self.wires]
-        signals = [ShownSignal(name, self._place(name)[0], self._units(name)) for name in shown]
+        signals = [ShownSignal(name, self.signals.place(name)[0], self.signals.units_of(name)) for name in shown]
         grid, why = signal_grid(t, self.data, signals, self.__getitem__)
         others = len(names) - len(shown)
         more = f"and {count_of(others, 'more signal')}: run.names, run['block.port']." if others else ""
@@ -222,7 +211,7 @@ class Run(ShownAsTable):
             return []
         from .signal_marks import is_of_a_plant
 
-        unnamed = (name for name in self._names_to_export(()) if name not in self.wires)
+        unnamed = (name for name in self.signals.to_export((), self.diagram_name) if name not in self.wires)
         return [name for name in unnamed if is_of_a_plant(self.diagram, name.rpartition(".")[0])]
 
     @classmethod
@@ -247,13 +236,11 @@ class Run(ShownAsTable):
         if end is None:
             until = f", until t = {stored.t[-1]:g} s" if n else ""
             end = {"messages": [f"This run did not end: it was killed, or still runs. It holds {n} samples{until}."]}
-        stopped, vector = end.get("stopped"), stored.head["vector"]
+        stopped = end.get("stopped")
         return cls(
             t=stored.t,
             data=stored.data,
-            layout=stored.layout,
-            wires=stored.wires,
-            units=stored.units,
+            signals=stored.signals,
             diagram=None,
             elapsed=end.get("elapsed", float("nan")),
             tier=str(end.get("tier", "interpreted")),
@@ -262,10 +249,7 @@ class Run(ShownAsTable):
             events=stored.events,
             stopped=None if stopped is None else Stopped(**stopped),
             residual=stored.residual,
-            columns=stored.columns,
-            has_states=vector["has_states"],
             diagram_name=stored.head["diagram"],
-            outputs=stored.head.get("outputs", {}),
         )
 
     def save(self, path: PathLike, *, overwrite: bool = False) -> None:
@@ -287,18 +271,7 @@ class Run(ShownAsTable):
         """
         folder = Path(path)
         prepare(folder, overwrite)
-        total, columns = self.layout.total, self.columns
-        head = header(
-            diagram=self.diagram_name,
-            layout=self.layout,
-            wires=self.wires,
-            units=self.units,
-            width=self.data.shape[1] if columns is None else total + int(np.sum(columns >= total)),
-            columns=columns,
-            has_states=self.has_states,
-            residual=self.residual is not None,
-            outputs=outputs_of(self.diagram.blocks) if self.outputs is None and self.diagram else self.outputs,
-        )
+        head = header(self.diagram_name, self.signals, residual=self.residual is not None)
         parts = [self.t[:, None], self.data, *([] if self.residual is None else [self.residual[:, None]])]
         end = {"elapsed": self.elapsed, "tier": self.tier, "messages": self.messages, "stopped": self.stopped}
         texts = {name: text.to_json() for name, text in self.texts.items()}
@@ -312,22 +285,22 @@ class Run(ShownAsTable):
     @property
     def names(self) -> list[str]:
         """Names of all recorded signals: the wires' names, then the ports' paths."""
-        return [n for n in (*sorted(self.wires), *self.layout.slices) if self._find_columns(n) is not None]
+        return [*self.signals.names]
 
-    @cached_property
-    def _position(self) -> np.ndarray | None:
-        """Column in ``data`` of every entry of a sample's vector; -1 where it has none."""
-        if self.columns is None:
-            return None
-        position = np.full(max([self.layout.total, *(self.columns + 1)]), -1)
-        position[self.columns] = np.arange(len(self.columns))
-        return position
+    @property
+    def wires(self) -> Mapping[str, Wire]:
+        """The named wires."""
+        return self.signals.wires
 
-    def _find_columns(self, full: str) -> np.ndarray | None:
-        """Return the columns of a signal in ``data``, in its shape; None if not all were recorded."""
-        where = entries(full, self.layout, self.wires)
-        where = where if self._position is None else self._position[where]
-        return where if np.all(where >= 0) else None
+    @property
+    def layout(self) -> Layout:
+        """Entries of the ports in a sample's vector."""
+        return self.signals.layout
+
+    @property
+    def has_states(self) -> bool:
+        """Whether the states were recorded."""
+        return self.signals.has_states
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return a signal, shape (N, *shape of the port); ``run["q[1]"]`` is its first entry, ``run["q"][:, 0]``.
@@ -354,49 +327,19 @@ class Run(ShownAsTable):
         UnknownNameError
             If no signal or several have that name, or if it was not recorded.
         """
-        shape, at = self._place(name)
+        shape, at = self.signals.place(name)
         values = self.data[samples, at] if isinstance(at, slice) else self.data[samples][:, at]
         return np.ascontiguousarray(values.reshape(len(values), *shape))
-
-    def _place(self, name: str) -> Place:
-        """Return a signal's shape, and its columns in ``data``."""
-        if isinstance(name, str) and name in self._places:
-            return self._places[name]
-        full = self._resolve(name)
-        if (where := self._find_columns(full)) is None:
-            raise UnknownNameError(
-                f"the signal {full!r} was not recorded in this run, as the selection left it out. Run again with "
-                f"record=[…, {full!r}], or without record for all signals."
-            )
-        self._places[name] = place_of(where)
-        return self._places[name]
-
-    def _resolve(self, name: str) -> str:
-        blocks = getattr(self.diagram, "blocks", None)
-        return resolve(name, self.wires, self.layout.slices, blocks, self.outputs)
-
-    def find_in(self, places: Places) -> None:
-        """Find signals where other runs of the same recording have found them."""
-        object.__setattr__(self, "_places", places)
 
     def _ipython_key_completions_(self) -> list[str]:
         return self.names
 
     def __contains__(self, name: str) -> bool:
-        try:
-            return self._find_columns(self._resolve(name)) is not None
-        except UnknownNameError:
-            return False
+        return name in self.signals
 
     def unit(self, name: str) -> str | tuple[str, ...] | None:
         """Return the unit of a signal, None where it is not declared."""
-        full, entry = split_entry(self._resolve(name), {*self.wires, *self.layout.slices})
-        wire = self.wires.get(full)
-        unit = self.units.get(full if wire is None else f"{wire.block}.{wire.port}")
-        if not isinstance(unit, tuple):
-            return unit
-        part = unit if wire is None or wire.index is None else unit[wire.index]
-        return part[entry[0] - 1] if entry and isinstance(part, tuple) else part
+        return self.signals.unit(name)
 
     def at(self, t: float) -> Snapshot:
         """Return all recorded signals and the states at the last sample not after ``t`` (in s).
@@ -416,10 +359,10 @@ class Run(ShownAsTable):
                 f"again with the states recorded; for a signal alone, take run[name][{k}]."
             )
         row = np.array(self.data[k])
-        found = ((name, self._find_columns(name)) for name in (*self.layout.slices, *self.wires))
+        signals = self.signals
+        found = ((name, signals.find_columns(name)) for name in (*signals.layout.slices, *signals.wires))
         values = {name: row[where] for name, where in found if where is not None}
-        first = self.layout.total if self.columns is None else int(np.searchsorted(self.columns, self.layout.total))
-        return Snapshot(float(self.t[k]), k, values, row[first:].copy(), dict(self.wires), self)
+        return Snapshot(float(self.t[k]), k, values, row[signals.first_state :].copy(), dict(signals.wires), self)
 
     def plot(
         self,
@@ -538,8 +481,8 @@ class Run(ShownAsTable):
         t = self.t[:last]
         start, end = (float(t[0]), float(t[-1])) if last else (0.0, 0.0)
         since = find_step(self.diagram, end, start, self.diagram_name) if since is None else float(since)
-        held = is_held(self.diagram, self._port_of(name))
-        return measure_info(name, self._units(name)[0], t, values[:last], since, held=held, final=final)
+        held = is_held(self.diagram, self.signals.port_of(name))
+        return measure_info(name, self.signals.units_of(name)[0], t, values[:last], since, held=held, final=final)
 
     def plot_path(
         self,
@@ -598,23 +541,17 @@ class Run(ShownAsTable):
         from .plots import DrawnSignal
         from .signal_marks import is_held, is_set_point, limits_of
 
-        port, own = self._port_of(name), self.diagram
+        port, own = self.signals.port_of(name), self.diagram
         return DrawnSignal(
             name,
             self.t,
             self[name],
-            self._units(name),
+            self.signals.units_of(name),
             run,
             is_set_point=is_set_point(own, port),
             is_held=is_held(own, port),
             limits=limits_of(own, port),
         )
-
-    def _port_of(self, name: str) -> tuple[str, str]:
-        """Return the block and the port that a signal is of."""
-        full, _ = split_entry(self._resolve(name), {*self.wires, *self.layout.slices})
-        wire = self.wires.get(full)
-        return (wire.block, wire.port) if wire is not None else (full.rpartition(".")[0], full.rpartition(".")[2])
 
     def _runs_to_draw(
         self, against: Run | Mapping[str, Run] | None, label: str, data: Sequence[MeasuredSignals] = ()
@@ -715,7 +652,7 @@ class Run(ShownAsTable):
         from .run_exports import to_xarray
 
         signals = {name: self[name] for name in self._names_to_export(names)}
-        return to_xarray(self.t, signals, {name: self._units(name) for name in signals}, self.diagram_name)
+        return to_xarray(self.t, signals, {name: self.signals.units_of(name) for name in signals}, self.diagram_name)
 
     def to_parquet(self, path: PathLike, *names: str) -> None:
         """Write ``t`` (s) and signals, all without names, as a Parquet file; columns are named as in `to_csv`.
@@ -756,23 +693,11 @@ class Run(ShownAsTable):
         from .run_exports import to_mat
 
         signals = {name: self[name] for name in self._names_to_export(names)}
-        units = {name: self._units(name) if self.unit(name) else None for name in signals}
+        units = {name: self.signals.units_of(name) if self.unit(name) else None for name in signals}
         to_mat(path, self.t, signals, units, self.diagram_name)
 
     def _names_to_export(self, names: Iterable[str]) -> list[str]:
-        """Return signals, each once: those given, else all that were recorded, but for ports that wires cover."""
-        names = list(names)
-        for name in names:
-            check_argument(name, kinds.text, "names", self.diagram_name)
-        if names:
-            return list(dict.fromkeys(names))
-        every = {name: entries(name, self.layout, self.wires) for name in self.names}
-        named = [name for name in every if name in self.wires]
-        covered = {int(k) for name in named for k in np.ravel(every[name])}
-        return [
-            *named,
-            *(n for n, own in every.items() if n not in self.wires and not covered.issuperset(np.ravel(own))),
-        ]
+        return self.signals.to_export(names, self.diagram_name)
 
     def _columns(self, names: Iterable[str], samples: slice = slice(None)) -> Iterator[tuple[str, np.ndarray]]:
         """Yield the name and the values of each column; entries of a vector are counted from 1."""
@@ -789,12 +714,5 @@ class Run(ShownAsTable):
 
         units: dict[str, str] = {}
         for name in self._names_to_export(names):
-            units |= zip(column_labels(name, self._place(name)[0]), self._units(name), strict=True)
+            units |= zip(column_labels(name, self.signals.place(name)[0]), self.signals.units_of(name), strict=True)
         return units
-
-    def _units(self, name: str) -> list[str]:
-        """Return the unit of each entry of a signal, "" where it is not declared."""
-        size, unit = int(np.prod(self._place(name)[0])), self.unit(name)
-        if not isinstance(unit, tuple):
-            return [unit or ""] * size
-        return list(unit) if len(unit) == size else [", ".join(unit)] * size

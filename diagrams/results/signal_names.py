@@ -1,4 +1,4 @@
-"""Names of a run's signals: full names, and the entries that they mean.
+"""Names of a run's signals: the full name that a short one means.
 
 ``name[i]`` is an entry of a vector, ``name[i,j]`` one of a matrix. In names entries are counted from 1, as in FMI; of a
 matrix a single number counts row by row, as the columns of exported tables do.
@@ -9,25 +9,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from ...blocks.core import Layout, UnknownNameError, near, primary_outputs
-from ..wiring import Wire, explain_absent_state, index_of, split_entry
+from ...blocks.core import UnknownNameError, near, primary_outputs
+from ..wiring import Wire, explain_absent_state, split_entry
 
 _COMPUTED = ("local", "output", "calculatedParameter")
-Place = tuple[tuple[int, ...], slice | np.ndarray]
-"""Shape of a signal, and its columns in a run's data."""
-Places = dict[str, Place]
-"""Places by the names that were asked for."""
 BlockOutputs = Mapping[str, Sequence[str]]
 """Names of outputs, secondary ones aside, by the path of their block."""
-
-
-def place_of(columns: np.ndarray) -> Place:
-    """Return the place of a signal whose entries are in some columns, in its shape."""
-    flat = columns.ravel()
-    together = flat.size and np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size))
-    return columns.shape, slice(int(flat[0]), int(flat[0]) + flat.size) if together else flat
 
 
 def resolve(
@@ -122,12 +109,3 @@ def _hidden_variable(name: str, blocks: Mapping[str, Any]) -> tuple[str, str] | 
     exact = [pair for pair in found if ".".join(pair) == name]
     one = exact or found
     return one[0] if len(one) == 1 else None
-
-
-def entries(full: str, layout: Layout, wires: Mapping[str, Wire]) -> np.ndarray:
-    """Return the numbers of a signal's entries in the vector of a sample, in the signal's shape."""
-    name, entry = split_entry(full, {*wires, *layout.slices})
-    wire = wires.get(name)
-    whole = layout.index(name if wire is None else f"{wire.block}.{wire.port}")
-    part = whole if wire is None or wire.index is None else np.asarray(whole[wire.index])
-    return np.asarray(part[index_of(entry, part.shape, name)]) if entry else part

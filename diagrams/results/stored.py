@@ -31,7 +31,6 @@ import numpy as np
 from ...blocks.core import (
     Layout,
     OptionError,
-    PortUnit,
     check_argument,
     describe_disk_error,
     explain_calls,
@@ -39,6 +38,7 @@ from ...blocks.core import (
     kinds,
 )
 from ..wiring import Wire
+from .recorded_signals import RecordedSignals
 
 FORMAT, VERSION = "loopwright run", 1
 HEADER, ROWS, EVENTS, END = "header.json", "rows.f64", "events.jsonl", "end.json"
@@ -129,25 +129,10 @@ class End(TypedDict, total=False):
     stopped: dict[str, Any] | None
 
 
-def header(
-    *,
-    diagram: str,
-    layout: Layout,
-    wires: Mapping[str, Wire],
-    units: Mapping[str, PortUnit],
-    width: int,
-    columns: Iterable[int] | None = None,
-    has_states: bool = True,
-    residual: bool = False,
-    outputs: Mapping[str, Sequence[str]] | None = None,
-) -> Header:
-    """Return the header of a stored run.
-
-    The vector of a sample has the ports of ``layout``, then the states, ``width`` entries, of which ``columns`` are
-    recorded (None for all). With ``residual`` each row ends with that of the algebraic loops. ``outputs`` are those of
-    `outputs_of`, by which a block's name is found to be a signal.
-    """
+def header(diagram: str, signals: RecordedSignals, *, residual: bool = False) -> Header:
+    """Return the header of a run of ``diagram``; with ``residual`` each row ends with that of the algebraic loops."""
     # Entries count from 1 and carry their port's name: other tools read these column names.
+    layout, units, width, columns = signals.layout, signals.units, signals.width, signals.columns
     entries = [""] * width
     for name, where in layout.slices.items():
         many = layout.shapes[name] != ()
@@ -167,15 +152,16 @@ def header(
             for n, s in layout.slices.items()
         ],
         "wires": {
-            name: {"block": w.block, "port": w.port, "index": _index_to_json(w.index)} for name, w in wires.items()
+            name: {"block": w.block, "port": w.port, "index": _index_to_json(w.index)}
+            for name, w in signals.wires.items()
         },
         "vector": {
             "width": width,
             "columns": None if columns is None else list(kept),
-            "has_states": has_states,
+            "has_states": signals.has_states,
             "residual": residual,
         },
-        "outputs": {path: list(names) for path, names in (outputs or {}).items()},
+        "outputs": {path: list(names) for path, names in signals.outputs.items()},
     }
 
 
@@ -285,29 +271,22 @@ class Stored:
     events: StoredEvents
 
     @property
-    def columns(self) -> np.ndarray | None:
-        """Entries of a sample's vector that were recorded, None for all."""
-        chosen = self.head["vector"]["columns"]
-        return None if chosen is None else np.array(chosen, dtype=int)
-
-    @property
-    def layout(self) -> Layout:
-        """Entries of each port in that vector."""
-        shapes = {s["name"]: tuple(s["shape"]) for s in self.head["signals"]}
-        first = {s["name"]: s["first"] for s in self.head["signals"]}
-        return Layout({n: slice(k, k + int(np.prod(shapes[n], dtype=int))) for n, k in first.items()}, shapes)
-
-    @property
-    def wires(self) -> dict[str, Wire]:
-        """The named wires."""
-        found = self.head["wires"].items()
-        return {name: Wire(w["block"], w["port"], _index_from_json(w["index"])) for name, w in found}
-
-    @property
-    def units(self) -> dict[str, PortUnit]:
-        """The units of ports."""
-        units = ((s["name"], s["unit"]) for s in self.head["signals"])
-        return {name: unit if isinstance(unit, str) else tuple(unit) for name, unit in units if unit is not None}
+    def signals(self) -> RecordedSignals:
+        """The signals that were recorded."""
+        ports, wires, vector = self.head["signals"], self.head["wires"], self.head["vector"]
+        shapes = {s["name"]: tuple(s["shape"]) for s in ports}
+        first = {s["name"]: s["first"] for s in ports}
+        places = {n: slice(k, k + int(np.prod(shapes[n], dtype=int))) for n, k in first.items()}
+        units = ((s["name"], s["unit"]) for s in ports)
+        return RecordedSignals(
+            Layout(places, shapes),
+            {name: Wire(w["block"], w["port"], _index_from_json(w["index"])) for name, w in wires.items()},
+            {name: unit if isinstance(unit, str) else tuple(unit) for name, unit in units if unit is not None},
+            vector["width"],
+            None if vector["columns"] is None else np.array(vector["columns"], dtype=int),
+            vector["has_states"],
+            stored_outputs=self.head.get("outputs", {}),
+        )
 
 
 def read(path: PathLike) -> Stored:

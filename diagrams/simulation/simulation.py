@@ -79,7 +79,14 @@ class Simulation:
         if saved is not None:
             check_fits(saved, self.flat, diagram.name)
         self._recording = Recording(
-            self.flat, diagram.name, options.record, options.every, options.states, options.to, options.overwrite
+            self.flat,
+            diagram.name,
+            diagram.blocks,
+            options.record,
+            options.every,
+            options.states,
+            options.to,
+            options.overwrite,
         )
         self._stack, self._loaded = ExitStack(), ExitStack()
         self._start_state = saved
@@ -446,16 +453,12 @@ class Simulation:
         run = Run(
             t=t,
             data=data,
-            layout=self.flat.log,
-            wires=dict(self.flat.table.names),
-            units=self._recording.units,
+            signals=self._recording.signals,
             diagram=self.diagram,
             **facts,
             texts=texts,
             events=recorder.events,
             residual=recorder.residual,
-            columns=recorder.columns,
-            has_states=self._recording.states,
             final_state=state,
             recipe=self.recipe,
         )

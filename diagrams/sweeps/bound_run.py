@@ -14,7 +14,7 @@ from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
 from ..coupling import note_loops, note_steps
 from ..flat import EVERY, FlatDiagram, WiredDiagram, renumber
-from ..results import Occurrence, Places, Recorder, Recording, Run, Stopped, outputs_of
+from ..results import Occurrence, Recorder, Recording, Run, Stopped
 from ..simulation import Engine, RunOptions, StartValues, default_step, note_held_inputs, refuse_rest, ticks_in
 from .variation import Numbers
 
@@ -40,7 +40,7 @@ class BoundRun:
             refuse_rest(self.flat, self.count, duration, diagram.name)
         self.end = float(self.count * self.flat.base + rest) if rest else None  # in s, where it is between two ticks
         record, every, states = options.record, options.every, options.states
-        self._recording = Recording(self.flat, diagram.name, record, every, states, None, False)
+        self._recording = Recording(self.flat, diagram.name, diagram.blocks, record, every, states, None, False)
         every_tick = base is not None or EVERY in self.flat.visited
         self._recording.check_memory(self.count, every_tick=every_tick)
         self.engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._note)
@@ -55,8 +55,6 @@ class BoundRun:
         )
         self._has_begun = False
         self._messages_before: dict[str, int] = {}
-        self._places: Places = {}
-        self._outputs = outputs_of(diagram.blocks)
         self._start = StartValues(self.engine.workspace) if StartValues.fits(self.flat) else None
         self._stack = ExitStack()
 
@@ -160,12 +158,10 @@ class BoundRun:
         residual: np.ndarray | None,
     ) -> Run:
         """Return a run from samples as the recorder keeps them; ``started`` is the clock's reading at its start."""
-        run = Run(
+        return Run(
             t=t,
             data=data,
-            layout=self.flat.log,
-            wires=self.flat.table.names,
-            units=self._recording.units,
+            signals=self._recording.signals,
             diagram=None,
             elapsed=perf_counter() - started,
             tier=self.engine.take_tier(),
@@ -173,13 +169,8 @@ class BoundRun:
             residual=residual,
             messages=(*self._notes, *self.engine.messages, *messages),
             stopped=stopped,
-            columns=self.recorder.columns,
-            has_states=self._recording.states,
             diagram_name=self._name,
-            outputs=self._outputs,
         )
-        run.find_in(self._places)
-        return run
 
     def _note(self, event: Occurrence) -> None:  # the engine is made before its recorder
         self.recorder.event(event)

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Layout, LoopwrightError, SimulationError
+from ...blocks.core import LoopwrightError, SimulationError
 from ...fmus import Fmu
 from ...fmus.platform import is_built_here
 from ...fmus.running import setup_of
 from ..flat import WiredDiagram
-from ..results import Run
+from ..results import RecordedSignals, Run
 from ..simulation import RunOptions, simulate
 from .bound_run import BoundRun, Progress
 from .outcome import Failure, SampleOutcome
@@ -90,7 +90,7 @@ class Worker:
         self.plan, self._options = plan, plan.run_options
         self._variation = Variation(plan.diagram)
         self._bound: OrderedDict[Any, BoundRun] = OrderedDict()
-        self._known_units: tuple[Layout, dict[str, str]] | None = None
+        self._known_units: tuple[RecordedSignals, dict[str, str]] | None = None
         self._alone = plan.obstacle
         """Why each run needs its own set-up, as a clause, where it does."""
         self._repeats = not self._alone
@@ -199,10 +199,10 @@ class Worker:
             raise failure.keep(run) from error
 
     def _units(self, run: Run) -> Mapping[str, str]:
-        if self._known_units is None or self._known_units[0] is not run.layout:
+        if self._known_units is None or self._known_units[0] is not run.signals:
             found = {name: run.unit(name) for name in self.plan.signals}
             for name, function in self.plan.reductions.items():
                 if isinstance(function, Reduction):
                     found[name] = run.unit(function.signal) if function.unit is None else function.unit
-            self._known_units = run.layout, {name: str(unit) for name, unit in found.items() if unit}
+            self._known_units = run.signals, {name: str(unit) for name, unit in found.items() if unit}
         return self._known_units[1]

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...blocks.core import Kind, OptionError, accepts, kinds, one_thread
 from ..flat import FlatDiagram, WiredDiagram
-from ..results import Run, entries, machine_memory, resolve, select
+from ..results import RecordedSignals, Run, machine_memory
 from ..simulation import ProgressOption, RunOptions, Simulation, progress_bar
 from .outcome import SampleOutcome
 from .plan import Plan
@@ -164,27 +164,24 @@ def make_plan(
     side_by_side = (_LANES if lanes else 1) if isinstance(lanes, bool) else int(lanes)
     plan = Plan(diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths), side_by_side)
     flat = Simulation(diagram, plan.run_options, duration=duration).flat  # it checks the options
+    signals_of_runs = RecordedSignals.of(flat)
     needed = [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]
-    table = flat.table
-    found = [resolve(signal, table.names, flat.log.slices, table.blocks) for signal in needed]
-    _check_recorded(plan, flat, found)
+    _check_recorded(plan, signals_of_runs, [signals_of_runs.resolve(signal) for signal in needed])
     if clash := sorted(set(chosen) & set(reductions)):
         raise OptionError(
             f"found {clash[0]!r} among signals and reductions; give the reduction another name.", block=name
         )
-    _check_room(plan, flat, count)
+    width = sum(signals_of_runs.entries(signals_of_runs.resolve(name)).size for name in chosen)
+    _check_room(plan, flat, count, width)
     return plan
 
 
-def _check_recorded(plan: Plan, flat: FlatDiagram, needed: Iterable[str]) -> None:
+def _check_recorded(plan: Plan, signals: RecordedSignals, needed: Iterable[str]) -> None:
     """Refuse a ``record`` that lacks signals that are kept, or reduced."""
-    wires, width = flat.table.names, flat.log.total + flat.width
-    columns = select(plan.run_options.record, flat.log, wires, width, states=False, blocks=flat.table.blocks)
-    if plan.options.get("record") is None or columns is None:
+    if plan.options.get("record") is None:
         return
-    kept = set(columns.tolist())
-    missing = [name for name in needed if not kept.issuperset(entries(name, flat.log, wires).ravel().tolist())]
-    if missing := list(dict.fromkeys(missing)):
+    recorded = signals.choose(plan.run_options.record, states=False)
+    if missing := list(dict.fromkeys(name for name in needed if name not in recorded)):
         raise OptionError(
             f"found a choice without {', '.join(map(repr, missing))}, which signals= or reduce= need; expected all "
             "that the sweep keeps. Add them, or leave record= out: each run then records what is kept alone.",
@@ -237,12 +234,8 @@ def _check_names(plan: Plan, swept: Sequence[str]) -> None:
         )
 
 
-def _check_room(plan: Plan, flat: FlatDiagram, count: int) -> None:
-    """Refuse a sweep whose samples can't fit into memory."""
-    names = flat.table.names
-    width = sum(
-        entries(resolve(name, names, flat.log.slices, flat.table.blocks), flat.log, names).size for name in plan.signals
-    )
+def _check_room(plan: Plan, flat: FlatDiagram, count: int, width: int) -> None:
+    """Refuse a sweep whose samples, of ``width`` numbers at each instant, can't fit into memory."""
     rows = int(plan.duration / float(flat.base)) // int(plan.run_options.every) + 2
     needed, there = 2 * 8 * (width + 1) * rows * count, machine_memory()
     if plan.signals and needed > 0.8 * there:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import OptionError, check_argument, kinds, primary_outputs
 from ..flat import FlatDiagram
-from ..results import entries, resolve
+from ..results import RecordedSignals
 from ..wiring import join
 
 PlotNames = Sequence[str | Sequence[str]]
@@ -41,14 +42,17 @@ class ShownColumns:
     name: str
     found: list[ShownColumn] = field(default_factory=list)
 
+    @cached_property
+    def signals(self) -> RecordedSignals:
+        """All signals of the diagram."""
+        return RecordedSignals.of(self.flat)
+
     def add(self, name: str) -> list[int]:
         """Return the numbers of the columns of a signal; new ones are appended.
 
         Raises `UnknownNameError` if there is no such signal.
         """
-        flat, wires = self.flat, self.flat.table.names
-        full = resolve(name, wires, flat.log.slices, flat.table.blocks)
-        places = entries(full, flat.log, wires)
+        places = self.signals.entries(self.signals.resolve(name))
         names = [name] if not places.ndim else [f"{name}[{_number(i)}]" for i in np.ndindex(places.shape)]
         return [self._add(each, int(place)) for each, place in zip(names, places.ravel(), strict=True)]
 

@@ -8,7 +8,7 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from importlib.resources import files
 from itertools import groupby
@@ -22,7 +22,7 @@ from ...blocks.core import OptionError, accepts, brief, check_file, explain_call
 from ..drawing import Drawing, Facts, draw
 from ..flat import Target, WiredDiagram
 from ..results import Run
-from ..wiring import Wire, join
+from ..wiring import Wire
 from .module import make_module
 from .notebook_link import Change, PageRecord, runs_in_kernel
 from .repeated import repeat
@@ -117,18 +117,15 @@ class WebPage:
         OptionError
             If nothing has come.
         """
-        flat, rows = self._played.columns.flat, self._rows()
+        rows, signals = self._rows(), self._played.columns.signals
+        columns = np.array([column.place for column in self._played.columns.found])
         return Run(
             t=rows[:, 0].copy(),
             data=rows[:, 1:],
-            layout=flat.log,
-            wires=dict(flat.table.names),
-            units={join(*port): unit for port, unit in flat.checked.units.items()},
+            signals=replace(signals, columns=columns, has_states=False),
             diagram=self._played.diagram,
             tier="page",
             messages=(self._record.message,) if self._record.message else (),
-            columns=np.array([column.place for column in self._played.columns.found]),
-            has_states=False,
         )
 
     @property

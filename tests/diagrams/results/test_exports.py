@@ -3,6 +3,7 @@
 import csv
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas
@@ -13,6 +14,7 @@ from scipy.io import loadmat
 
 from loopwright.blocks import OptionError, UnknownNameError
 from loopwright.diagrams import Run
+from loopwright.diagrams.results import RecordedSignals
 from loopwright.diagrams.results import run_exports as _exports
 from loopwright.types import Layout, Wire
 
@@ -34,7 +36,8 @@ def make(n=200, **changes):
     if n > 9:
         t[5] = t[4]  # before and after an event
         data[:5, 8] = [np.nan, np.inf, -np.inf, -0.0, 5e-324]
-    fields = {"t": t, "data": data, "layout": LAYOUT, "wires": WIRES, "units": UNITS, "diagram": None}
+    signals = RecordedSignals(LAYOUT, WIRES, UNITS, LAYOUT.total + 1)
+    fields = {"t": t, "data": data, "signals": signals, "diagram": None}
     return Run(**(fields | {"diagram_name": "crane"} | changes))
 
 
@@ -202,7 +205,7 @@ def test_a_signal_that_the_format_cannot_hold_is_refused(run, tmp_path, monkeypa
 
 
 def test_without_names_all_ports_go_out_where_no_wire_has_one(tmp_path):
-    frame = make(wires={}).to_pandas()
+    frame = make(signals=RecordedSignals(LAYOUT, {}, UNITS, LAYOUT.total + 1)).to_pandas()
     assert list(frame)[:3] == ["plant.position[1]", "plant.position[2]", "plant.mass[1]"]
     assert len(frame.columns) == LAYOUT.total
 
@@ -210,7 +213,7 @@ def test_without_names_all_ports_go_out_where_no_wire_has_one(tmp_path):
 def test_only_what_was_recorded_goes_out():
     columns = np.array([0, 9])
     run = make()
-    run = make(data=run.data[:, columns], columns=columns, has_states=False)
+    run = make(data=run.data[:, columns], signals=replace(run.signals, columns=columns, has_states=False))
     assert list(run.to_pandas()) == ["x", "η/ξ error"]
     with pytest.raises(UnknownNameError, match=r"the signal 'v' was not recorded"):
         run.to_pandas("v")

@@ -16,7 +16,8 @@ from loopwright.diagrams import Run
 from loopwright.diagrams.results import memory as _memory
 from loopwright.diagrams.results import recorder as _recorder
 from loopwright.diagrams.results.memory import check_memory
-from loopwright.diagrams.results.recorder import Recorder, select
+from loopwright.diagrams.results.recorded_signals import RecordedSignals
+from loopwright.diagrams.results.recorder import Recorder
 from loopwright.diagrams.results.stored import header
 from loopwright.types import Layout, Occurrence, Stopped, Wire
 
@@ -27,7 +28,8 @@ WIDTH = 6
 
 def head(columns=None, residual=False, layout=LAYOUT, width=WIDTH):
     units = {"a.y": "m", "box.b.v": ("m", "m/s")}
-    return header(diagram="d", layout=layout, wires=WIRES, units=units, width=width, columns=columns, residual=residual)
+    kept = None if columns is None else np.array(columns)
+    return header("d", RecordedSignals(layout, WIRES, units, width, kept), residual=residual)
 
 
 def samples(n, width=WIDTH):
@@ -166,10 +168,11 @@ KILLED = """
 import os, signal, sys
 import numpy as np
 from loopwright.types import Layout, Occurrence
+from loopwright.diagrams.results.recorded_signals import RecordedSignals
 from loopwright.diagrams.results.recorder import Recorder
 from loopwright.diagrams.results.stored import header
 layout = Layout.of({"a.y": (), "b.v": (2,)})
-recorder = Recorder(3, to=sys.argv[1], header=header(diagram="d", layout=layout, wires={}, units={}, width=3))
+recorder = Recorder(3, to=sys.argv[1], header=header("d", RecordedSignals(layout, {}, {}, 3)))
 for k in range(20_000):
     recorder.row(k / 1000, np.array([k, -k, k * k], dtype=float))
     if k % 1000 == 0:
@@ -227,11 +230,12 @@ import resource, sys
 import numpy as np
 from loopwright.blocks import SimulationError
 from loopwright.types import Layout
+from loopwright.diagrams.results.recorded_signals import RecordedSignals
 from loopwright.diagrams.results.recorder import Recorder
 from loopwright.diagrams.results.stored import header
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_003, 100_003))  # in the middle of a row
 layout = Layout.of({"a.y": (), "b.v": (2,)})
-recorder = Recorder(3, to=sys.argv[1], header=header(diagram="d", layout=layout, wires={}, units={}, width=3))
+recorder = Recorder(3, to=sys.argv[1], header=header("d", RecordedSignals(layout, {}, {}, 3)))
 try:
     for k in range(20_000):
         recorder.row(k / 1000, np.full(3, float(k)))
@@ -325,13 +329,13 @@ def test_every_is_a_positive_integer(every):
     ],
 )
 def test_a_selection_takes_signals_blocks_and_subsystems(names, states, expected):
-    found = select(names, LAYOUT, WIRES, WIDTH, states=states)
+    found = RecordedSignals(LAYOUT, WIRES, {}, WIDTH).choose(names, states=states).columns
     assert (found if found is None else found.tolist()) == expected
 
 
 def test_a_selection_refuses_a_name_that_is_not_there():
     with pytest.raises(UnknownNameError, match=r"no signal 'box\.b\.u' .*Did you mean 'box\.b\.v'"):
-        select(["box.b.u"], LAYOUT, WIRES, WIDTH)
+        RecordedSignals(LAYOUT, WIRES, {}, WIDTH).choose(["box.b.u"])
 
 
 def test_memory_is_checked_against_what_is_really_recorded(monkeypatch):

@@ -11,7 +11,6 @@ import pytest
 from loopwright.blocks import Constant, Gain, OptionError, Reference, Sine, UnitDelay, UnknownNameError
 from loopwright.diagrams import Diagram, Run, subsystem
 from loopwright.diagrams.results import stored as _stored
-from loopwright.diagrams.results.recorder import select
 from loopwright.types import Occurrence, Stopped
 
 
@@ -92,8 +91,8 @@ def waves():
 
 def chosen(run, *names, states=True):
     """Return the run as it is when only these signals were recorded."""
-    columns = select(names, run.layout, run.wires, run.data.shape[1], states=states)
-    return replace(run, data=run.data[:, columns], columns=columns, has_states=states)
+    signals = run.signals.choose(names, states=states)
+    return replace(run, data=run.data[:, signals.columns], signals=signals)
 
 
 def test_a_run_of_chosen_signals_gives_them_as_the_whole_run_does(waves):
