@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,10 +20,9 @@ from ...fmus.running import Fmu
 from ..linearization import PlantEquations, copy_point, find_signal, hold_sources, linearize, linearize_plant
 from ..simulation import RunOptions, simulate
 from .attached_environment import attach_environment
-from .contact_ports import Ports
-from .coupled_parts import ContactParts
 from .moored_plant import Mooring, library_class, moored_diagram
-from .stability_limits import GROWTH_AT, ContactLimit, CoupledLoop, to_rates
+from .stability_limits import GROWTH_AT, ContactLimit, to_rates
+from .touched_plant import TouchedPlant
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram
@@ -59,54 +58,11 @@ class TrialMethod(Enum):
     """A block next to an FMU in co-simulation: the loop has another limit, and its own linear prediction."""
 
 
-class TriedContact(Protocol):
-    """A contact, as its limits are tried; a protocol, as `Contact` itself is above this file and calls it."""
-
-    @property
-    def wired(self) -> WiredDiagram:
-        """Its diagram."""
-
-    @property
-    def plant(self) -> str:
-        """Path of the plant."""
-
-    @property
-    def direction(self) -> np.ndarray:
-        """Unit vector of the environment's direction."""
-
-    @property
-    def point(self) -> OperatingPoint:
-        """Operating point."""
-
-    @property
-    def parts(self) -> ContactParts:
-        """Plant and controller."""
-
-    @property
-    def ports(self) -> Ports:
-        """Ports of the plant."""
-
-    @property
-    def entry(self) -> str | None:
-        """Wire to which the environment's force is added."""
-
-    @property
-    def sample_time(self) -> float:
-        """Period of the controller in s."""
-
-    @property
-    def shortest(self) -> float:
-        """Shortest time between its ticks in s."""
-
-    def loop(self, vary: str, **environment: float) -> CoupledLoop:
-        """Return the loop with an environment of which one property varies."""
-
-
 @dataclass
 class LimitTrials:
     """Runs next to a limit, and predictions for them."""
 
-    contact: TriedContact
+    contact: TouchedPlant
     limit: ContactLimit
     method: TrialMethod
     _still: WiredDiagram = field(repr=False)
@@ -114,7 +70,7 @@ class LimitTrials:
     _known: dict[float, np.ndarray] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, contact: TriedContact, limit: ContactLimit, method: TrialMethod | str | None) -> LimitTrials:
+    def of(cls, contact: TouchedPlant, limit: ContactLimit, method: TrialMethod | str | None) -> LimitTrials:
         """Return the trials of a contact's limit."""
         chosen = _choose(contact, limit, method)
         model = None
@@ -262,7 +218,7 @@ class LimitTrials:
         return {sensor: mass}
 
 
-def _choose(contact: TriedContact, limit: ContactLimit, method: TrialMethod | str | None) -> TrialMethod:
+def _choose(contact: TouchedPlant, limit: ContactLimit, method: TrialMethod | str | None) -> TrialMethod:
     """Return the place of the environment: the one that is asked for, or the first that is possible."""
     block = contact.wired.blocks[contact.plant]
     has_mass = limit.vary == "mass" or limit.environment.get("mass", 0.0) > 0.0
@@ -403,7 +359,7 @@ class ContactConfirmation:
     push=kinds.positive.worded("a positive velocity in m/s", "Give one."),
 )
 def confirm_limit(
-    contact: TriedContact, limit: ContactLimit, push: float = PUSH, method: TrialMethod | str | None = None
+    contact: TouchedPlant, limit: ContactLimit, push: float = PUSH, method: TrialMethod | str | None = None
 ) -> ContactConfirmation:
     """Run a contact's diagram at 0.97 and at 1.03 of a limit; see `Contact.confirm`."""
     push = float(push)
@@ -439,7 +395,7 @@ def confirm_limit(
     return result
 
 
-def try_limit(contact: TriedContact, limit: ContactLimit) -> ContactConfirmation:
+def try_limit(contact: TouchedPlant, limit: ContactLimit) -> ContactConfirmation:
     """Return the confirmation of a limit by the largest push that leaves the diagram linear."""
     for push in PUSHES[:-1]:
         try:
@@ -482,7 +438,7 @@ def _measure_uneven(t: np.ndarray, signal: np.ndarray, omega: float, begin: floa
     return float(np.log(sizes[1] / sizes[0]) / window)
 
 
-def _check(contact: TriedContact, limit: ContactLimit) -> None:
+def _check(contact: TouchedPlant, limit: ContactLimit) -> None:
     """Refuse the limit of another contact, and one that has no two sides."""
     if not (math.isfinite(limit.value) and limit.value > 0.0):
         raise OptionError(

@@ -16,14 +16,13 @@ from ..linearization import check_options, operating_point
 from .admittance import ContactAdmittance, compute_admittance
 from .contact_loop import close_loop, join_environment
 from .contact_ports import PortNames, Ports
-from .coupled_parts import ContactParts, take_apart
+from .coupled_parts import take_apart
 from .environment import (
     A_FREQUENCY,
     check_properties,
     check_property,
     points_in_a_decade,
     read_row,
-    read_vector,
 )
 from .passivity import (
     CONTINUOUS,
@@ -36,7 +35,8 @@ from .passivity import (
     find_negative,
     find_passivity,
 )
-from .stability_limits import PER_DECADE, ContactLimit, ContactMap, CoupledLoop, find_limit, map_growth, read_scan
+from .stability_limits import PER_DECADE, ContactLimit, ContactMap, find_limit, map_growth, read_scan
+from .touched_plant import TouchedPlant
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram
@@ -51,7 +51,7 @@ SIDES = ("par", "perp")
 
 @explain_calls
 @dataclass(frozen=True, eq=False)
-class Contact:
+class Contact(TouchedPlant):
     """A point of a diagram's plant that an environment touches, linear at an operating point; `Diagram.contact`.
 
     The environment is a spring k_e, a damper b_e and a mass m_e along ``direction``; a tool of the mass ``tool_mass``
@@ -77,15 +77,9 @@ class Contact:
         Kinks, stairs and flat slopes that the linear model leaves out.
     """
 
-    wired: WiredDiagram
-    plant: str
-    direction: np.ndarray
     side: str
-    point: OperatingPoint
-    parts: ContactParts = field(repr=False)
     filter: AdmittanceFilter | None = field(repr=False)
     scale: float
-    ports: Ports = field(repr=False)
     measured: str | None = field(repr=False)
 
     def __repr__(self) -> str:
@@ -102,21 +96,6 @@ class Contact:
     def diagram(self) -> Any:
         """The `Diagram` of the contact."""
         return self.wired.facade
-
-    @property
-    def sample_time(self) -> float:
-        """Sample time of the controller in s, the common period of several rates; 0 if the diagram is continuous."""
-        return self.parts.sample_time
-
-    @property
-    def shortest(self) -> float:
-        """Shortest time between ticks in s: the sample time in one rate; 0 if the diagram is continuous."""
-        return self.parts.shortest
-
-    @property
-    def entry(self) -> str | None:
-        """Wire to which the environment's force is added; None if the controller does not measure it."""
-        return self.parts.entry
 
     @property
     def derivation(self) -> Derivation:
@@ -167,11 +146,6 @@ class Contact:
         """
         sign = find_sign(self, low=low, high=high, per_decade=per_decade)
         return replace(sign, port=find_passivity(self.parts, self.direction, stable=sign.stable))
-
-    def loop(self, vary: str, **environment: float) -> CoupledLoop:
-        """Return the loop with an environment of which one property varies; see `stability_limit`."""
-        held = check_properties(environment, vary)
-        return CoupledLoop.of(self.parts, self.direction, vary, held)
 
     def stability_limit(
         self,
@@ -327,7 +301,7 @@ def make_contact(
         parts, _ = take_apart(diagram, ports, force, point, taken)
     unit, side, scale = _find_direction(diagram, point, ports, direction, parts.force.shape[1])
     return Contact(
-        diagram, ports.plant, unit, side, point, parts, _find_filter(diagram, side, len(unit)), scale, ports, force
+        diagram, ports, unit, point, parts, side, _find_filter(diagram, side, len(unit)), scale, measured=force
     )
 
 
@@ -359,9 +333,9 @@ def _find_direction(
         place = np.asarray(point.values[f"{ports.plant}.{ports.position}"], dtype=float)
         q = 1.0 - float(frame.curvature) * float(frame.normal @ (place - frame.sigma))
         return np.asarray(frame.tangent, dtype=float), direction, q
-    vector = read_vector(direction)
-    length = 0.0 if vector is None else float(np.linalg.norm(vector))
-    if vector is None or vector.shape != (many,) or not 0.0 < length < math.inf:
+    vector = np.atleast_1d(np.asarray(direction, dtype=float)) if kinds.numbers.holds(direction) else np.zeros(0)
+    length = float(np.linalg.norm(vector))
+    if vector.shape != (many,) or not 0.0 < length < math.inf:
         raise OptionError(
             f"found {direction!r}; expected a vector of {many} finite entries that is not zero. Give one in the axes "
             "of the force.",

@@ -31,10 +31,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...blocks.core import Array
+from ...blocks.core import Array, ParameterError, accepts
 from ..frequency import advance_held, hold_inputs
 from .coupled_parts import ContactParts, StateMatrices
-from .environment import check_environment
+from .environment import VALUES
 
 SLOW, SLOW_RATE = 1e-3, 1.0
 """Distance of |z| from 1, and rate in 1/s, within which a stable mode is looked at."""
@@ -66,6 +66,7 @@ class Rows(NamedTuple):
     force: np.ndarray
 
 
+@accepts("environment", ParameterError, stiffness=VALUES, damping=VALUES, mass=VALUES, tool_mass=VALUES.or_none())
 def join_environment(
     parts: ContactParts,
     direction: np.ndarray,
@@ -75,7 +76,6 @@ def join_environment(
     tool_mass: Array | None = None,
 ) -> Joined:
     """Return the plant with spring, damper and mass along a direction; properties may be arrays, to be broadcast."""
-    check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
     tool = parts.tool_mass if tool_mass is None else tool_mass
     k, b, m, more = (
         np.asarray(v, dtype=float)[..., None, None]
