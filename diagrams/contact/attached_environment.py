@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks import Constant, Hold, Step, Sum
+from ...blocks import Constant, Hold, Step
 from ...blocks.core import AlgebraicLoopError, Array, Block, Input, OptionError, Output, State, parameter
 from ...fmus.running import Fmu
 from ..linearization import PlantEquations
 from ..wiring import Structure, SubsystemSettings, Wire
 from .contact_ports import Ports
-from .moored_plant import Mooring, copy_table, hold_separately, set_tool
+from .moored_plant import Mooring, add_forces, copy_table, hold_separately
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram
@@ -130,12 +130,7 @@ def attach_environment(
     the plant stays in co-simulation, and the force is held between communication points.
     """
     path, block = ports.plant, diagram.blocks[ports.plant]
-    if measured is not None and measured.port[0] == path:
-        raise OptionError(
-            f"found {measured.name!r}, which the plant measures itself; expected a sensor outside of it.", block=path
-        )
-    table = copy_table(diagram)
-    set_tool(table, tool)
+    table = copy_table(diagram, tool)
     taken = {*table.blocks, *table.subsystems}
     name = next(n for n in (BLOCK + "_" * k for k in range(99)) if n not in taken)
     held_by = f"{name}_sampling"
@@ -182,16 +177,11 @@ def attach_environment(
         table.wires[path_of, port] = wire
     table.wires[path, ports.force] = Wire(path_of, "total")
     if measured is not None:
-        felt = hold_separately(table, measured.port[0], felt, f"{name}_felt")
-        terms = [felt]
+        terms = [hold_separately(table, measured.port[0], felt, f"{name}_felt")]
         if not held and mooring.mass:
             inertia = Wire(path_of, "inertia")
             terms.append(inertia if tick is None else _sample(table, held_by, inertia, "inertia_before"))
-        total = f"{name}_sum"
-        _reroute(table, {measured.port: Wire(total, "y")}, keep=path_of)
-        table.blocks[total], table.subsystem_of[total] = Sum(signs="+" * (1 + len(terms)), name=total), ""
-        for i, wire in enumerate((Wire(*measured.port), *terms), 1):
-            table.wires[total, f"u{i}"] = wire
+        add_forces(table, measured, terms, f"{name}_sum", {(path_of, port) for port in at})
     try:
         return diagram.with_structure(table)
     except AlgebraicLoopError:  # by a mass, a continuous controller, or an FMU that does not list its dependencies

@@ -196,6 +196,12 @@ class LimitTrials:
             kick_start=begin,
         )
         source = find_signal(still.flatten_like(contact.point), contact.entry) if contact.entry else None
+        if source is not None and source.port[0] == contact.plant:
+            raise OptionError(
+                f"found {source.name!r}, which the plant measures itself; expected a sensor outside of it, to whose "
+                "force that of the environment is added. Put a ForceSensor there, and name its wire: force=….",
+                block=contact.plant,
+            )
         if self.method is TrialMethod.INSIDE:
             ports = (contact.ports.force, contact.ports.position, contact.ports.velocity)
             return moored_diagram(still, contact.plant, ports, source, mooring, tool)

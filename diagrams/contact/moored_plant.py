@@ -6,7 +6,7 @@ the diagram's FMU. A plant that is a block of the diagram is replaced by one wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -164,7 +164,7 @@ def moored_diagram(
             f"found {type(block).__name__}, which is no plant of the library; expected one of {', '.join(LIBRARY)}.",
             block=plant,
         )
-    table = copy_table(diagram)
+    table = copy_table(diagram, tool)
     if isinstance(block, Fmu):
         names = {new: old for old, new in block.rename.items()}
         force, position, velocity = (names.get(port, port) for port in ports)
@@ -176,33 +176,39 @@ def moored_diagram(
         table.blocks[plant] = made(
             **{k: v for k, v in values.items() if v is not None}, **mooring.parameters(), name=block.label
         )
-    set_tool(table, tool)
     if measured is not None:
-        source = measured.port
-        if source[0] == plant:
-            raise OptionError(
-                f"found {measured.name!r}, which the plant measures itself; expected a sensor outside of it.",
-                block=plant,
-            )
+        felt = hold_separately(table, measured.port[0], Wire(plant, FORCE), "environment_held")
         total = "environment_sum"
         while total in table.blocks or total in table.subsystems:
             total += "_"
-        for group in (table.wires, table.controls):
-            for key, wire in list(group.items()):
-                if (wire.block, wire.port) == source and key != (plant, ports[0]):
-                    group[key] = Wire(total, "y", wire.index)  # type: ignore[index]
-        table.blocks[total], table.subsystem_of[total] = Sum(name=total), ""
-        felt = hold_separately(table, source[0], Wire(plant, FORCE), "environment_held")
-        table.wires[total, "u1"], table.wires[total, "u2"] = Wire(*source), felt
+        add_forces(table, measured, [felt], total, {(plant, ports[0])})
     return diagram.with_structure(table)
 
 
-def copy_table(diagram: WiredDiagram) -> Structure:
-    """Return a copy of a diagram's structure, in which the delays of subsystems have become blocks."""
+def copy_table(diagram: WiredDiagram, tool: Mapping[str, float] | None) -> Structure:
+    """Return a copy of a diagram's structure, in which the delays of subsystems are blocks, and sensors have tools.
+
+    ``tool`` holds the mass in kg beyond a force sensor, by the sensor's path.
+    """
     table = diagram.scheduled.copy()
     for path, settings in table.subsystems.items():
         table.subsystems[path] = replace(settings, delay=0)
+    for path, mass in (tool or {}).items():
+        table.blocks[path] = table.blocks[path].replace(tool_mass=mass)
     return table
+
+
+def add_forces(
+    table: Structure, measured: Tap, forces: Sequence[Wire], total: str, others: Collection[tuple[str, str]]
+) -> None:
+    """Add forces to a measured one, by a sum of the path ``total``, for all readers but the inputs ``others``."""
+    for group in (table.wires, table.controls):
+        for key, wire in list(group.items()):
+            if (wire.block, wire.port) == measured.port and key not in others:
+                group[key] = Wire(total, "y", wire.index)  # type: ignore[index]
+    table.blocks[total], table.subsystem_of[total] = Sum(signs="+" * (1 + len(forces)), name=total), ""
+    for i, wire in enumerate((Wire(*measured.port), *forces), 1):
+        table.wires[total, f"u{i}"] = wire
 
 
 def hold_separately(table: Structure, block: str, wire: Wire, name: str) -> Wire:
@@ -215,12 +221,6 @@ def hold_separately(table: Structure, block: str, wire: Wire, name: str) -> Wire
     table.blocks[path], table.subsystem_of[path] = Hold(name=name), subsystem
     table.wires[path, "u"] = wire
     return Wire(path, "y")
-
-
-def set_tool(table: Structure, tool: Mapping[str, float] | None) -> None:
-    """Give a force sensor another tool; None leaves it its own."""
-    for path, mass in (tool or {}).items():
-        table.blocks[path] = table.blocks[path].replace(tool_mass=mass)
 
 
 def _own_start(block: Fmu, cls: type[Block]) -> Mapping[str, Any]:

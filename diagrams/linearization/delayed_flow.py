@@ -274,7 +274,8 @@ class DelayLine:
 
     def flow_over(self, place: int, signals: Slopes) -> Slopes:
         """Return the continuous states at the end of the flow."""
-        found = self.flow.tables[place][0].get(0, np.zeros((len(self.flow.A), self.flow.width))) @ signals
+        now = self.flow.tables[place][0].get(0, np.zeros((len(self.flow.A), self.flow.width)))
+        found: Slopes = now @ signals
         found.by_state[:, found.by_state.shape[1] - len(self) :] += self._read(place)[: len(self.flow.A)]
         return found
 
@@ -286,7 +287,7 @@ class DelayLine:
         else:
             new = np.zeros((size, self.flow.width))
             new[np.arange(min(m, size)), self.kept[: min(m, size)]] = 1.0
-        found = new @ signals
+        found: Slopes = new @ signals
         found.by_state[:, found.by_state.shape[1] - size :] += np.eye(size, k=m if self.ahead else -m)
         return found
 

@@ -166,11 +166,21 @@ class Chain:
         if self._coupled is None:
             p = self._step_plants(z, state, of_plants, following)
         else:
-            n, p_before = state.total, np.zeros((of_plants.total, state.total + x.by_d.shape[1]), dtype=W.dtype)
+            n, m = state.total, x.by_d.shape[1]
+            p_before = np.zeros((of_plants.total, n + m), dtype=W.dtype)
             p_before[:, state.slices["p"]] = np.eye(of_plants.total)
-            parts = (part.side_by_side for part in (x, z, w))
-            end = self._end_time(following)
-            step = LinearStep(*parts, p_before, here.t, end, x_end, here.w, tick["z"], dict(of_plants.slices))
+            step = LinearStep(
+                x.side_by_side,
+                z.side_by_side,
+                w.side_by_side,
+                p_before,
+                here.t,
+                self._end_time(following),
+                x_end,
+                here.w,
+                tick["z"],
+                dict(of_plants.slices),
+            )
             self._models |= self._coupled.go(step, lambda path, z: self._model_plant(path, z, h), flow_by_w)
             x, p, z, w = (Slopes.split(part, n) for part in (step.x, step.p, step.z, step.w))
         after = [x, p, z, *([w] if self._holds else []), *([line.move(place, signals)] if line and signals else [])]
@@ -212,7 +222,7 @@ class Chain:
     def _step_plants(self, z: Slopes, state: Layout, of_plants: Layout, following: int) -> Slopes:
         """Return the FMUs' states at the next tick; those of FMUs whose steps end later stay."""
         A, B = (join_matrices(self.flat, self.models, which) for which in "AB")
-        p = B @ z
+        p: Slopes = B @ z
         p.by_state[:, state.slices["p"]] += A
         for path in self.paths:
             if self._until[path] != following:
