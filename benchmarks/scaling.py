@@ -26,7 +26,7 @@ import numpy as np
 
 from loopwright.blocks import Gain, Sine, Sum, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled import write_hybrid, write_ticks
+from loopwright.diagrams.compiled import functions_between, write_code
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 
 SIZES = (10, 30, 100, 300, 1000, 3000, 10000)
@@ -157,10 +157,7 @@ def compile_again(diagram: Diagram, sampled: bool) -> None:
     """Compile a diagram's functions, as at the first time in a process."""
     flat = diagram.flatten(1e-3)
     kinds = kinds_of(flat, every=not sampled)
-    if sampled:
-        write_ticks(flat, kinds).load()
-    else:
-        write_hybrid(flat, kinds, stiff=False).load()
+    write_code(flat, kinds, () if sampled else functions_between(flat, stiff=False)).load()
 
 
 def exponent(sizes, times) -> float:

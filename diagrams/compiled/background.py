@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from threading import Thread
-from typing import Any, Generic
+from typing import Any
 
 from ...blocks.core import LoopwrightError
 from ..flat import FlatDiagram
-from .function_code import Code, Sources
+from .diagram_code import DiagramCode, Sources
 
 _WRITING = 3e-5  # s to write the C code of an operation
 _COMPILING = 1e-3  # s to compile it
@@ -17,8 +17,8 @@ _SHARE = 0.2  # of the time that a run still takes, at most, for writing code
 _LEAST = 0.1  # s that a run still takes at least, for code that is in the cache; with a compiler ten times as much
 
 
-class BackgroundCode(Generic[Code]):
-    """C code of a diagram's ticks, made while they are interpreted, as soon as the run is long enough for it.
+class BackgroundCode:
+    """C code of a diagram's functions, made while they are interpreted, as soon as the run is long enough for it.
 
     A run that is short never waits, and starts no compiler. The compiler is its own process.
     """
@@ -26,15 +26,17 @@ class BackgroundCode(Generic[Code]):
     def __init__(
         self,
         flat: FlatDiagram,
-        write: Callable[[], Sources[Code]],
+        write: Callable[[], Sources],
         prepare: Callable[[], Any] = lambda: None,
     ):
         self._flat, self._write, self._prepare = flat.origin, write, prepare  # other numbers change no code
-        self._sources: Sources[Code] | None = None
+        self._sources: Sources | None = None
         self._thread: Thread | None = None
         self._over = False
         self.ready = False
-        self.code: Code | None = None  # none before, and where it can't replace interpreted ticks to the last bit
+        self.code: DiagramCode | None = (
+            None  # none before, and where it can't replace interpreted ticks to the last bit
+        )
         self.failure: Exception | None = None  # no compiler, one that fails, or a cache that does
 
     def look(self, spent: float, rest: float) -> None:
@@ -75,7 +77,7 @@ class BackgroundCode(Generic[Code]):
         if self._thread is not None:
             self._thread.join()
 
-    def _load(self, sources: Sources[Code]) -> None:
+    def _load(self, sources: Sources) -> None:
         try:
             self._prepare()
             self.code = sources.load()

@@ -18,13 +18,13 @@ from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
 from .bound_functions import CALL, TICK, FunctionInC, TickStructure, at
+from .diagram_code import DiagramCode
 from .grouped_functions import GroupedTick
 from .newton import NewtonOptions, NewtonStructure
 from .plants_called_back import PythonStep, RemotePlants
 from .rate_differences import SlopesByDifferences
 from .runtime import load_runtime
 from .staged import NativeModelExchange
-from .tick_code import TickCode
 
 _SEEN = 1e-6  # least singular value, relative to 1 + the loop's gain, that differences surely tell from 0
 
@@ -101,8 +101,8 @@ class CompiledLoop:
 
     Parameters
     ----------
-    code : TickCode
-        The ticks.
+    code : DiagramCode
+        The functions of the diagram.
     arguments, results : sequence of ndarray
         The vectors (t, x, w, p) and (x_next, z, log, ok) of the run.
     plants : sequence of FmuInstance or PythonStep
@@ -130,7 +130,7 @@ class CompiledLoop:
 
     def __init__(
         self,
-        code: TickCode,
+        code: DiagramCode,
         arguments: Sequence[np.ndarray],
         results: Sequence[np.ndarray],
         plants: Sequence[FmuInstance | PythonStep],
@@ -222,7 +222,7 @@ class CompiledLoop:
 
     def bind_loops(
         self,
-        code: TickCode,
+        code: DiagramCode,
         clocks: frozenset[TickPattern],
         arguments: Sequence[np.ndarray],
         options: NewtonOptions | None,

@@ -11,19 +11,14 @@ from typing import Any
 from ...blocks.core import CompilerError, FmuError
 from ...fmus.export import describe_processor, inline_model, own_functions, processor_flags, tune
 from ...fmus.platform import is_built_here
-from ..flat import FlatDiagram, TickPattern, WiredDiagram, share_terms
+from ...fmus.runtime import read_sources
+from ..flat import FlatDiagram, TickPattern, WiredDiagram
 from .bound_functions import GeneratedCode
 from .compiled_libraries import load_compiled
+from .diagram_code import FUSING, DiagramCode, compile_code
+from .expanded_functions import ExpandedFunctions, LoopEquations
 from .generated_text import write_functions
-from .hybrid_code import FUSING
 from .reordered import reorder
-from .tick_code import (
-    LOOP_OVER_TICKS,
-    TickCode,
-    compile_loops,
-    compile_ticks,
-    loop_source,
-)
 
 _LIMIT = "0x1p20"  # LW_FAST_LIMIT
 _KINDS_WRITTEN_TWICE = 16  # kinds of ticks that are written twice
@@ -65,32 +60,37 @@ def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
 
 def compile_fused(
     flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants: Mapping[str, FusedPlant]
-) -> TickCode:
+) -> DiagramCode:
     """Compile the ticks at which sets of clocks act, the plants' equations, and the loop over both as one unit."""
     flat, key = flat.origin, tuple(plants.values())
-    known: dict[tuple[FusedPlant, ...], TickCode] = flat.made["fused ticks"]
+    known: dict[tuple[FusedPlant, ...], DiagramCode] = flat.made["fused ticks"]
     if key not in known or tuple(known[key].ticks) != tuple(acting):
         known[key] = _compile(flat, acting, plants)
     return known[key]
 
 
-def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants: Mapping[str, FusedPlant]) -> TickCode:
+def _compile(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants: Mapping[str, FusedPlant]
+) -> DiagramCode:
     models, steps, inside = _write_models(plants)
-    found = {} if flat.by_block else {clocks: flat.at_tick(clocks).last.fast for clocks in acting}
-    straight = bool(found) and all(function.is_a("SXFunction") for function in found.values())
-    functions = {clocks: share_terms(f, f"tick{i}") for i, (clocks, f) in enumerate(found.items())} if straight else {}
-    text = "\n".join([_SYSTEM, _write_ticks([*functions.values()]), models, steps, loop_source()])
+    ticks = None if flat.by_block else ExpandedFunctions(flat, acting)
+    if ticks is not None and not ticks.exact:  # tables and matrices stay as they are
+        ticks = None
+    loop = read_sources("newton.c", "remote.c", "loop_over_ticks.c")
+    text = "\n".join([_SYSTEM, "" if ticks is None else _write_ticks(ticks.functions), models, steps, loop])
     library = load_compiled(text, (*processor_flags(), *FUSING), describe_processor())
-    run_ticks = library[LOOP_OVER_TICKS]
+    run_ticks = library["loopwright_run"]
     run_ticks.restype = None
     notes = tuple(f"Fused: the equations of {path} are in the loop, compiled with the ticks." for path in inside)
-    if not functions:
-        return replace(compile_ticks(flat, acting), run_ticks=run_ticks, notes=notes)
-    bound = {clocks: GeneratedCode(library).find(f) for clocks, f in functions.items()}
+    if ticks is None:
+        return replace(compile_code(flat, acting), run_ticks=run_ticks, notes=notes)
     notes += (
         "Fused: the ticks are compiled for this processor; values differ by rounding, which some motions magnify.",
     )
-    return TickCode(bound, True, library, compile_loops(flat, acting), run_ticks, notes)
+    found, between = ticks.find(GeneratedCode(library))
+    equations = LoopEquations(flat, acting)
+    loops = equations.find(GeneratedCode(load_compiled(equations.text()))) if equations.functions else {}
+    return DiagramCode(found, between, loops, True, library, run_ticks=run_ticks, notes=notes)
 
 
 def _write_models(plants: Mapping[str, FusedPlant]) -> tuple[str, str, list[str]]:

@@ -1,4 +1,4 @@
-"""Functions of large diagrams as runs of equal blocks, bound to vectors: ticks, rates, indicators, jumps."""
+"""Functions of a large diagram as runs of equal blocks: ticks, rates, indicators, jumps; see `grouping`."""
 
 from __future__ import annotations
 
@@ -6,15 +6,28 @@ import ctypes
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ..flat import bind_function
-from .bound_functions import BlockBinder, BoundFunction, FunctionInC, TickStructure, at, call_for_c, list_vectors
-from .grouping import BlockCalls, PartTables, PythonCall, TickTables
-from .kernels import Kernels
+from ..flat import FlatDiagram, PartProgram, TickPattern, bind_function
+from .bound_functions import (
+    BlockBinder,
+    BoundFunction,
+    CodeOfFunctions,
+    FunctionInC,
+    TickStructure,
+    address_of,
+    at,
+    call_for_c,
+    list_vectors,
+)
+from .grouping import BlockCalls, PartTables, PythonCall, TickTables, make_part_tables, make_tables
+from .kernels import BlockKinds, Kernels
 from .machine import BlockProgramStructure
+from .rate_differences import Columns, SlopesByDifferences, find_columns
+from .runtime import load_runtime
 
 _AT, _INT = ctypes.c_void_p, ctypes.c_int64
 _Python = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
@@ -177,3 +190,53 @@ def _bind_python(call: PythonCall, functions: Mapping[int, Any], v: np.ndarray, 
         bound.call()
 
     return evaluate
+
+
+class GroupedFunctions:
+    """Ticks, and functions between them, of a large diagram: kernels for its kinds of blocks, and tables for these."""
+
+    def __init__(self, flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], between: Sequence[str] = ()):
+        self._flat, self._stiff = flat, "slope" in between
+        self._ticks = {clocks: flat.program_at(clocks) for clocks in kinds}
+        self._parts = {name: flat.part_program(name) for name in between if name != "slope"}
+        programs = [tick.program for tick in self._ticks.values()] + [part.program for part in self._parts.values()]
+        self._blocks = BlockKinds(flat, programs)
+        self._counts = {name: _count_operations(part) for name, part in self._parts.items()}
+        self._tables = dict[Kernels, tuple[dict[frozenset[TickPattern], TickTables], dict[str, PartTables]]]()
+        self.operations, self.exact = self._blocks.operations, self._blocks.exact
+
+    def text(self) -> str:
+        """Return the C code of the kernels."""
+        return self._blocks.source
+
+    def find(
+        self, code: CodeOfFunctions
+    ) -> tuple[Mapping[frozenset[TickPattern], FunctionInC], Mapping[str, FunctionInC]]:
+        """Return ticks, and functions between them, with kernels where C finds them."""
+        kernels = self._blocks.find(code)
+        if kernels not in self._tables:
+            tables = {clocks: make_tables(tick, kernels.of) for clocks, tick in self._ticks.items()}
+            self._tables[kernels] = tables, {n: make_part_tables(part, kernels.of) for n, part in self._parts.items()}
+        of_ticks, of_parts = self._tables[kernels]
+        tick, part = (address_of(load_runtime(), f"loopwright_grouped_{name}") for name in ("tick", "part"))
+        ticks = {clocks: GroupedTick(tables, kernels, tick) for clocks, tables in of_ticks.items()}
+        between: dict[str, FunctionInC] = {
+            name: GroupedPart(tables, kernels, part, self._counts[name]) for name, tables in of_parts.items()
+        }
+        if self._stiff:
+            between["slope"] = SlopesByDifferences(between["flow"], self._columns)
+        return ticks, between
+
+    def find_steps(self, code: CodeOfFunctions) -> Mapping[str, int]:
+        """Return no generated steps: these are made for small rates."""
+        return {}
+
+    @cached_property
+    def _columns(self) -> Columns:
+        return find_columns(self._parts["flow"], self._flat.continuous)
+
+
+def _count_operations(part: PartProgram) -> int:
+    """Return the operations of one evaluation."""
+    of = part.program.functions
+    return sum(of[op.kernel].n_instructions() for op in part.operations if op.kernel in of)

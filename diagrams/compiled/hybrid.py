@@ -14,9 +14,9 @@ from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, MethodKind
 from .bound_functions import CALL, CompiledFunction, FunctionInC, TickStructure, at
 from .compiled_loop import CompiledLoop, OutcomeStructure
+from .diagram_code import DiagramCode
 from .event_domains import Domains
 from .grouped_functions import GroupedPart
-from .hybrid_code import HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
 from .library_method import LibraryMethod, StepFailure
 from .newton import NewtonOptions, NewtonStructure
@@ -111,7 +111,7 @@ class CompiledHybrid:
 
     Parameters
     ----------
-    code : HybridCode
+    code : DiagramCode
         The functions.
     flat : FlatDiagram
         The diagram.
@@ -147,7 +147,7 @@ class CompiledHybrid:
 
     def __init__(
         self,
-        code: HybridCode,
+        code: DiagramCode,
         flat: FlatDiagram,
         loop: CompiledLoop,
         arguments: Sequence[np.ndarray],
@@ -206,7 +206,7 @@ class CompiledHybrid:
         results = [slopes]
         if loops is not None:
             m = len(loops.where)
-            self._solver = loop.bind_loops(code.ticks, NONE, trial, loops)
+            self._solver = loop.bind_loops(code, NONE, trial, loops)
             hybrid.p.loops, hybrid.p.here = ctypes.addressof(self._solver), at(x)
             hybrid.solved = self._own(np.zeros(m))
             if not isinstance(slope, SlopesByDifferences):

@@ -50,6 +50,11 @@ class Columns:
             np.array(where, dtype=np.int64), *(np.array(v, dtype=np.int32) for v in (columns, first, every, ends))
         )
 
+    @classmethod
+    def dense(cls, where: Sequence[int] | np.ndarray) -> Columns:
+        """Return the columns where each result may depend on each entry, and there are as many of both."""
+        return cls.of(where, [np.arange(len(where))] * len(where))
+
     @property
     def pattern(self) -> tuple[np.ndarray, np.ndarray]:
         """Row and column of each entry."""

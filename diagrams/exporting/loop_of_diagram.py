@@ -24,13 +24,13 @@ from ...fmus.export import (
 from ..compiled import (
     CompiledHybrid,
     CompiledLoop,
+    DiagramCode,
     NamedCode,
-    TickCode,
     function_text,
+    functions_between,
     load_runtime,
     read_memory,
-    write_hybrid,
-    write_ticks,
+    write_code,
 )
 from ..coupling import bind
 from ..flat import NONE, FlatDiagram, TickPattern, bits_of, flatten, has_all_kinds, kinds_of
@@ -107,8 +107,7 @@ def loop_spec(
         facts["left"] = None if left is None else CFunction.of(left)
         functions += [] if left is None else [left]
     else:
-        sources = write_ticks(flat, acting, straight=True, whole=True)
-        loop = _bind_ticks(workspace, sources.make([code] * len(sources.writers)))
+        loop = _bind_ticks(workspace, write_code(flat, acting, whole=True).find(code))
         memory = read_memory({"loop": loop.structure}, vectors, loop.kept, code)
     plants, more = merge(opened, flat, flat.parameters.total)
     memory = _with_parameters(memory, here.p, more)
@@ -231,7 +230,7 @@ def _choose_solver(continuous: Continuous, step: float) -> str:
     return implicit if _STIFF < fastest * step < np.inf else explicit
 
 
-def _bind_ticks(workspace: Workspace, ticks: TickCode) -> CompiledLoop:
+def _bind_ticks(workspace: Workspace, ticks: DiagramCode) -> CompiledLoop:
     """Return the loop over ticks, bound to the numbers of a start, without plants."""
     flat, here = workspace.flat, workspace.here
     return CompiledLoop(
@@ -252,12 +251,12 @@ def _bind_hybrid(
 ) -> CompiledHybrid:
     """Return the loop with continuous states, bound to the numbers of a start, without plants."""
     flat, here = workspace.flat, workspace.here
-    sources = write_hybrid(flat, acting, stiff=is_stiff(continuous), straight=True)
-    made = sources.make([code] * len(sources.writers))
+    between = functions_between(flat, stiff=is_stiff(continuous))
+    made = write_code(flat, acting, between, whole=True).find(code)
     return CompiledHybrid(
         made,
         flat,
-        _bind_ticks(workspace, made.ticks),
+        _bind_ticks(workspace, made),
         [here.t, here.x, here.w, here.p],
         workspace.x_next,
         methods_of(continuous),

@@ -7,7 +7,7 @@ from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
 from .enabling_and_triggers import TRUE, is_true
 from .evaluation import JUMP, Apart, Instant, evaluate, just_after, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
-from .flat_diagram import EXACT_LOOP, FlatDiagram
+from .flat_diagram import FlatDiagram
 from .flat_functions import indicators_of, trace_guarded_tick
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .flatten import flatten, renumber, write_numbers
@@ -25,7 +25,6 @@ __all__ = [
     "CHOOSE",
     "COPY",
     "EVERY",
-    "EXACT_LOOP",
     "JUMP",
     "LESS",
     "NONE",

@@ -35,8 +35,6 @@ _EACH = 3
 """Operations of a tick for each output value of an FMU: its size, the sum of sizes, the entry of the log."""
 MOST_KEPT = 24
 """Functions of others that are kept with a diagram's own."""
-EXACT_LOOP = 4
-"""Values of algebraic loops up to which interpreted and compiled runs solve them alike, to the last bit."""
 
 
 class _shared(cached_property[T]):  # noqa: N801 (a decorator)

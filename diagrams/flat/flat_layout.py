@@ -181,8 +181,12 @@ class FlatLayout:
     @cached_property
     def hybrid(self) -> bool:
         """Whether something happens between ticks: continuous states, events, or a transport delay."""
-        delayed = any(self.table.blocks[self.ports[name][0]].transport for name in self.plant_inputs.slices)
-        return bool(self.continuous.size or self.events or delayed or self.in_model_exchange)
+        return bool(self.continuous.size or self.events or self.has_delays or self.in_model_exchange)
+
+    @cached_property
+    def has_delays(self) -> bool:
+        """Whether there is a transport delay in continuous time."""
+        return any(self.table.blocks[self.ports[name][0]].transport for name in self.plant_inputs.slices)
 
     @cached_property
     def in_model_exchange(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..flat import EXACT_LOOP, FlatDiagram, TickPattern
+from ..flat import FlatDiagram, TickPattern
 
 if TYPE_CHECKING:
     from ..compiled import NewtonOptions
@@ -25,6 +25,7 @@ ITERATIONS, HALVINGS = 50, 30
 """Steps of Newton's method, and halvings of one, at most."""
 SINGULAR = 1e-13
 """Least singular value of J that determines the values, relative to 1 + the loop's gain."""
+_FEW = 4  # values of loops whose linear equations are solved by the operations of `newton.c`, in the same order
 _ASIDE = 1e-3  # step along a direction in which J is zero, relative to 1 + the size of the values
 _APART = 1e-6  # distance of two solutions, relative to 1 + their size
 _STARTS = (0.0, 1.0, -1.0, 10.0, -10.0, 0.1, -0.1, 100.0, -100.0)
@@ -79,7 +80,7 @@ class LoopSolver:
             if not self._size(v) > ROUNDING:
                 break
             try:
-                direction = _eliminate(self.J, r) if len(r) <= EXACT_LOOP else np.linalg.solve(self.J, r)
+                direction = _eliminate(self.J, r) if len(r) <= _FEW else np.linalg.solve(self.J, r)
             except np.linalg.LinAlgError:  # the shortest step, to one of many solutions if there are any
                 direction = np.linalg.lstsq(self.J, r)[0] if np.all(np.isfinite(self.J)) else np.array([math.nan])
             if not np.all(np.isfinite(direction)):

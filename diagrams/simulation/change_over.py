@@ -20,14 +20,14 @@ class ChangeOver:
 
     def __init__(self, position: Position):
         self._position, self._possible = position, True
-        self._later: BackgroundCode[Any] | None = None
+        self._later: BackgroundCode | None = None
         self._spent = 0.0
 
     def watch(
         self,
         last: int,
         progress: Callable[[float], Any],
-        make: Callable[[], BackgroundCode[Any]],
+        make: Callable[[], BackgroundCode],
         take_over: Callable[[], None],  # called once the code is there
     ) -> Callable[[float], Any]:
         """Return a ``progress`` for an interpreted run from here up to a tick, which has the code made in time."""
@@ -45,7 +45,7 @@ class ChangeOver:
 
         return arrive
 
-    def _look(self, make: Callable[[], BackgroundCode[Any]], rest: float) -> None:
+    def _look(self, make: Callable[[], BackgroundCode], rest: float) -> None:
         if self._later is None:
             self._later = make()
         self._later.look(self._spent, rest)

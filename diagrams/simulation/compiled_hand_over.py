@@ -10,11 +10,10 @@ import numpy as np
 from ..compiled import (
     CompiledHybrid,
     CompiledLoop,
+    DiagramCode,
     HandedOver,
-    HybridCode,
     MethodOptions,
     NativeModelExchange,
-    TickCode,
 )
 from ..flat import NONE
 from ..results import Recorder
@@ -31,7 +30,7 @@ _MOST_EDGES = 100_000  # discontinuities of sources in a call
 def bind_loop(
     workspace: Workspace,
     plants: PlantsInC,
-    code: TickCode,
+    code: DiagramCode,
     recorder: Recorder,
     stops: Sequence[int],
     exchange: NativeModelExchange | None = None,
@@ -57,7 +56,7 @@ def bind_loop(
 
 
 def bind_hybrid(
-    code: HybridCode,
+    code: DiagramCode,
     workspace: Workspace,
     continuous: Continuous,
     plants: PlantsInC,
@@ -83,7 +82,7 @@ def bind_hybrid(
         )
     )
     native = None if handed is None else handed.native
-    ticks = bind_loop(workspace, plants, code.ticks, recorder, stops, native, rest)
+    ticks = bind_loop(workspace, plants, code, recorder, stops, native, rest)
     loop = CompiledHybrid(
         code,
         flat,

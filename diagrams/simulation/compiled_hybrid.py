@@ -15,15 +15,16 @@ from ...blocks.core import SimulationError
 from ..compiled import (
     BackgroundCode,
     CompiledHybrid,
+    DiagramCode,
     HandedOver,
-    HybridCode,
     HybridOutcome,
     HybridReason,
     Sign,
     Span,
-    compile_hybrid,
-    hybrid_sources,
-    interpret_hybrid,
+    code_sources,
+    compile_code,
+    functions_between,
+    interpret_code,
 )
 from ..flat import EVERY, NONE, ClockSets, FlatDiagram, TickPattern, kinds_of, ticks_after, times_of
 from ..results import Recorder
@@ -87,15 +88,16 @@ class HybridTicks:
         )
         return *((compiled,) if continuous.where.size else ()), *((fused,) if self._is_fused else ())
 
-    def hand_over(self, code: HybridCode) -> None:
+    def hand_over(self, code: DiagramCode) -> None:
         """Let generated code of the same functions continue; C must not run meanwhile."""
         self._code.hand_over(code)
         if self._loop is not None:
             self._loop.take_steps(code.steps)
 
-    def make_later(self) -> BackgroundCode[HybridCode]:
+    def make_later(self) -> BackgroundCode:
         """Return generated code of these functions that is made while they are interpreted."""
-        write = partial(hybrid_sources, self._flat, self._acting, stiff=self._stiff)
+        between = functions_between(self._flat, stiff=self._stiff)
+        write = partial(code_sources, self._flat, self._acting, between)
         return BackgroundCode(self._flat, write, self._plants.prepare())
 
     # --- continuing ------------------------------------------------------------------------------------------------
@@ -361,12 +363,12 @@ class HybridTicks:
 
 def find_code(
     flat: FlatDiagram, continuous: Continuous, *, every: bool, machine: bool, fuse: bool = False
-) -> HybridCode:
+) -> DiagramCode:
     """Return the functions of a run for the virtual machine, or compiled; see `HybridTicks`."""
-    acting, stiff = kinds_of(flat, every=every), is_stiff(continuous)
+    acting, between = kinds_of(flat, every=every), functions_between(flat, stiff=is_stiff(continuous))
     if machine:
-        return interpret_hybrid(flat, acting, stiff=stiff)
-    return compile_hybrid(flat, acting, stiff=stiff, fuse=fuse)
+        return interpret_code(flat, acting, between)
+    return compile_code(flat, acting, between, fuse=fuse)
 
 
 def is_stiff(continuous: Continuous) -> bool:

@@ -16,19 +16,18 @@ from ...fmus.calls import FmuInstance
 from ..compiled import (
     BackgroundCode,
     CompiledLoop,
+    DiagramCode,
     FusedPlant,
     Outcome,
     ReturnReason,
-    TickCode,
     bind_call,
+    code_sources,
+    compile_code,
     compile_fused,
-    compile_ticks,
-    interpret_ticks,
-    write_ticks,
+    interpret_code,
 )
 from ..flat import (
     EVERY,
-    EXACT_LOOP,
     ClockSets,
     FlatDiagram,
     TickPattern,
@@ -55,10 +54,6 @@ _RK4 = 1  # the integrator of exported FMUs that is compiled into a fused loop
 _SIGNS = (
     "Compiled: it has tables or large matrix products, in which signs of zeros may differ from those of an interpreted "
     "run."
-)
-_LOOPS = (
-    "Compiled: an algebraic loop has {} values. C solves the linear equations of Newton's method with another rounding "
-    "than an interpreted run, so that its values may differ by some 1e-14 times the condition of these equations."
 )
 
 
@@ -100,9 +95,9 @@ class CompiledTicks:
         self._workspace, self._plants, self._every, self._stops = workspace, plants, every, stops
         acting = kinds_of(flat, every=every)
         if machine:
-            self._code = interpret_ticks(flat, acting)
+            self._code = interpret_code(flat, acting)
         else:
-            self._code = _fuse(flat, plants, acting) if fuse else compile_ticks(flat, acting)
+            self._code = _fuse(flat, plants, acting) if fuse else compile_code(flat, acting)
         self._loop: CompiledLoop | None = None
         self._recorder: Recorder | None = None
         self._numbers = {clocks: kind for kind, clocks in enumerate(self._code.ticks)}
@@ -114,18 +109,15 @@ class CompiledTicks:
     @property
     def messages(self) -> tuple[str, ...]:
         """How far results may differ from those of an interpreted run; empty where every bit is the same."""
-        largest = max((len(self._flat.active_loops(clocks)) for clocks in self._code.loops), default=0)
-        if largest > EXACT_LOOP:
-            return (*self._code.notes, _LOOPS.format(largest))
         return self._code.notes + (() if self._code.exact else (_SIGNS,))
 
-    def hand_over(self, code: TickCode) -> None:
+    def hand_over(self, code: DiagramCode) -> None:
         """Let generated code of the same ticks continue; C must not run meanwhile."""
         self._code, self._loop = code, None
 
-    def make_later(self) -> BackgroundCode[TickCode]:
+    def make_later(self) -> BackgroundCode:
         """Return generated code of these ticks that is made while they are interpreted."""
-        write = partial(write_ticks, self._flat.origin, [*self._code.ticks])
+        write = partial(code_sources, self._flat, [*self._code.ticks])
         return BackgroundCode(self._flat, write, self._plants.prepare())
 
     def run(
@@ -243,7 +235,7 @@ class CompiledTicks:
 
 
 def bind_evaluations(
-    workspace: Workspace, find_code: Callable[[], TickCode]
+    workspace: Workspace, find_code: Callable[[], DiagramCode]
 ) -> dict[frozenset[TickPattern], Callable[[], None]]:
     """Return the evaluations of ticks in C, with the bits of interpreted ones; empty where they can't be had."""
     # The functions of a large diagram take seconds to trace as a whole, and calls of its blocks need none of them.
@@ -259,7 +251,7 @@ def bind_evaluations(
     return {clocks: bind_call(tick, vectors, results) for clocks, tick in code.ticks.items()} if code.exact else {}
 
 
-def _fuse(flat: FlatDiagram, plants: PlantsInC, acting: Sequence[frozenset[TickPattern]]) -> TickCode:
+def _fuse(flat: FlatDiagram, plants: PlantsInC, acting: Sequence[frozenset[TickPattern]]) -> DiagramCode:
     from ...fmus.running import Fmu  # only such a run needs the block
 
     found = {}

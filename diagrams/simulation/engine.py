@@ -14,7 +14,7 @@ import numpy as np
 
 from ...blocks.core import Block, CompilerError, SimulationError, UnknownNameError, near
 from ...fmus.calls import FmuInstance
-from ..compiled import TickCode, compile_ticks, find_code_obstacle, find_obstacle, interpret_ticks
+from ..compiled import DiagramCode, compile_code, find_obstacle, interpret_code
 from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_model_exchange, to_coupling
 from ..flat import FlatDiagram, kinds_of
 from ..model_exchange import BlocksInModelExchange, ModelExchangeBlock
@@ -142,13 +142,13 @@ class Engine:
         if self._compile is True:
             self._make_compiled(machine=False)
 
-    def _find_tick_code(self) -> TickCode:
+    def _find_tick_code(self) -> DiagramCode:
         """Return the code of the ticks, for an evaluation of one."""
         machine = self._compile is not True
         if self.continuous is not None:
-            return find_code(self.flat, self.continuous, every=self.every_tick, machine=machine).ticks
+            return find_code(self.flat, self.continuous, every=self.every_tick, machine=machine)
         acting = kinds_of(self.flat, every=self.every_tick)
-        return interpret_ticks(self.flat, acting) if machine else compile_ticks(self.flat, acting)
+        return interpret_code(self.flat, acting) if machine else compile_code(self.flat, acting)
 
     def _find_start(self, set_start: Callable[[Workspace], None]) -> None:
         delays = None if self.continuous is None else self.continuous.delays
@@ -191,8 +191,7 @@ class Engine:
         """Make the loop in C, with generated code or the virtual machine; a message says where code can't be had."""
         plants, stops, continuous = self._plants_in_c(), self._stops.entries, self.continuous
         options = {"every": self.every_tick, "machine": machine, "fuse": self._fuse}
-        find = find_obstacle if continuous is None else find_code_obstacle
-        obstacle = None if machine else find(self.flat)
+        obstacle = None if machine else find_obstacle(self.flat)
         found: CompiledTicks | HybridTicks | None = None
         if obstacle is None:
             try:

@@ -19,7 +19,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Run, subsystem
-from loopwright.diagrams.compiled import background, compiled_libraries, runtime
+from loopwright.diagrams.compiled import background, compiled_libraries, expanded_functions, runtime
 from loopwright.diagrams.simulation import RunOptions, change_over, compiled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
@@ -167,7 +167,7 @@ def test_a_short_run_asks_for_no_code(monkeypatch):
     monkeypatch.setattr(
         change_over, "perf_counter", lambda: 1e-4 * next(clock)
     )  # 0.1 ms a chunk, whatever else goes on
-    with mock.patch.object(compiled_ticks, "write_ticks", side_effect=AssertionError("written")):
+    with mock.patch.object(expanded_functions, "write_functions", side_effect=AssertionError("written")):
         assert len(sums().simulate(20.0, compile="auto", **QUIET).t) == 2001
 
 

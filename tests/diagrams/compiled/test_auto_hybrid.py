@@ -168,9 +168,9 @@ def test_a_stop_condition_ends_it_in_c_at_its_event(eager):
 
 
 def test_without_a_compiler_the_virtual_machine_goes_on(eager, monkeypatch):
-    from loopwright.diagrams.compiled import function_code
+    from loopwright.diagrams.compiled import diagram_code
 
-    monkeypatch.setattr(function_code, "load_compiled", _fail)
+    monkeypatch.setattr(diagram_code, "load_compiled", _fail)
     runs = [thermostat().simulate(10.0, step=0.05, **QUIET) for _ in range(2)]
     assert [len(run.messages) for run in runs] == [1, 0]
     assert "no such compiler" in runs[0].messages[0]

@@ -5,7 +5,7 @@ import re
 import casadi as ca
 
 from loopwright.diagrams import experiments
-from loopwright.diagrams.compiled import write_ticks
+from loopwright.diagrams.compiled import write_code
 from loopwright.diagrams.compiled.generated_text import write_functions
 from loopwright.diagrams.compiled.reordered import put_in_order
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
@@ -15,7 +15,7 @@ ASKED = re.compile(r"arg\[\d+\]\?|if\s*\(res\[\d+\]!=0\)")
 
 def test_a_tick_does_not_ask_at_each_number_whether_its_vector_is_there():
     flat = experiments.hand_guiding().diagram.flatten()
-    (text,) = write_ticks(flat, kinds_of(flat, every=False)).texts
+    (text,) = write_code(flat, kinds_of(flat, every=False)).texts
     assert "res[2][55]=" in text
     assert not ASKED.search(text)
 

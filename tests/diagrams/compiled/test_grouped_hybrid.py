@@ -18,7 +18,7 @@ from loopwright.blocks import (
 )
 from loopwright.blocks.core import SimulationError
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled import write_hybrid
+from loopwright.diagrams.compiled import functions_between, write_code
 from loopwright.diagrams.compiled.rate_differences import find_columns
 from loopwright.diagrams.flat import NONE, flat_diagram
 
@@ -66,7 +66,10 @@ def test_a_ring_of_lags_is_the_matrix_exponential(grouped, solver):
 
 def test_the_code_of_many_blocks_is_as_short_as_that_of_few(grouped):
     """A compiler reads no more of it: straight-line code of 300 blocks took it seconds."""
-    texts = [write_hybrid(ring(n)[0].flatten(1e-3), [NONE], stiff=True).texts[0] for n in (20, 60)]
+    texts = []
+    for n in (20, 60):
+        flat = ring(n)[0].flatten(1e-3)
+        texts.append(write_code(flat, [NONE], functions_between(flat, stiff=True)).texts[0])
     assert abs(len(texts[1]) - len(texts[0])) < 0.02 * len(texts[0])
 
 
@@ -168,10 +171,10 @@ def test_all_blocks_are_gone_through_once_for_the_instants_between_ticks(grouped
         lambda *given, **more: (made.append(given[2]), evaluate(*given, **more))[1],
     )
     flat = ring(12)[0].flatten(0.1)
-    sources = write_hybrid(flat, [NONE], stiff=False)
+    sources = write_code(flat, [NONE], functions_between(flat, stiff=False))
     assert made == [NONE]  # for rates, outputs, and where it is asked whether these may fail at steps
     del sources
-    write_hybrid(flat, [NONE], stiff=False)
+    write_code(flat, [NONE], functions_between(flat, stiff=False))
     assert made == [NONE, NONE]  # it is large, and isn't kept
 
 

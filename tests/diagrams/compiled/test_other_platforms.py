@@ -7,7 +7,7 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, Product, PythonFunction, Relay, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.compiled import compiled_libraries, fused, write_hybrid, write_ticks
+from loopwright.diagrams.compiled import compiled_libraries, functions_between, fused, write_code
 from loopwright.diagrams.lanes import lane_code
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 from loopwright.fmus.export.compiler import TARGETS
@@ -60,9 +60,9 @@ def sources():
             if grouped:
                 patch.setattr("loopwright.diagrams.flat.flat_diagram.LARGEST", 0)
             flat = sampled().flatten(1e-3)
-            found[f"ticks, grouped {grouped}"] = "\n".join(write_ticks(flat, kinds_of(flat, every=False)).texts)
+            found[f"ticks, grouped {grouped}"] = "\n".join(write_code(flat, kinds_of(flat, every=False)).texts)
             flat = between_ticks().flatten()
-            texts = write_hybrid(flat, kinds_of(flat, every=True), stiff=True).texts
+            texts = write_code(flat, kinds_of(flat, every=True), functions_between(flat, stiff=True)).texts
             found[f"between ticks, grouped {grouped}"] = "\n".join(texts)
     return found
 

@@ -5,7 +5,7 @@ import pytest
 
 from loopwright.blocks import Integrator, Product, Relay, Sine, Step, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled import hybrid_code
+from loopwright.diagrams.compiled import expanded_functions
 from loopwright.diagrams.compiled.small_steps import write_steps
 
 QUIET = {"progress": False, "compile": True}
@@ -46,7 +46,7 @@ def test_inlined_steps_have_the_bits_of_steps_for_every_diagram(make, solver, mo
     options = {"solver": solver, "step": 0.01, **QUIET}
     assert "step_rk4" in steps_of(make())
     inlined = make().simulate(1.0, **options)
-    monkeypatch.setattr(hybrid_code, "write_steps", lambda rates, where: "")
+    monkeypatch.setattr(expanded_functions, "write_steps", lambda rates, where: "")
     other = make().simulate(1.0, **options)
     assert inlined.tier == other.tier == "compiled"
     assert inlined.data.tobytes() == other.data.tobytes()

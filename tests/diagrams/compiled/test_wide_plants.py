@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.diagrams import Diagram
-from loopwright.diagrams.compiled import write_ticks
+from loopwright.diagrams.compiled import write_code
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 from loopwright.fmus import Fmu
 from support.small_fmus import small_fmu
@@ -40,7 +40,7 @@ def test_the_code_is_as_long_for_five_thousand_outputs_as_for_one_thousand(cache
     sizes = []
     for count in (1000, 5000):
         flat = Diagram("d", Fmu(wide(tmp_path / str(count), count), name="plant")()).flatten(0.1)
-        sizes.append(sum(map(len, write_ticks(flat, kinds_of(flat, every=True)).texts)))
+        sizes.append(sum(map(len, write_code(flat, kinds_of(flat, every=True)).texts)))
     assert abs(sizes[1] - sizes[0]) < 100
     assert sizes[1] < 50_000
 

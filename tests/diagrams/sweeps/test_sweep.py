@@ -402,9 +402,9 @@ def gained(source):
 
 
 def test_a_seed_that_is_fixed_in_the_code_compiles_nothing_by_default(monkeypatch):
-    from loopwright.diagrams.compiled import tick_code
+    from loopwright.diagrams.compiled import diagram_code
 
-    monkeypatch.setattr(tick_code, "load_compiled", lambda *_: pytest.fail("it compiles"))
+    monkeypatch.setattr(diagram_code, "load_compiled", lambda *_: pytest.fail("it compiles"))
     diagram = gained(Dice(name="dice").y)
     found = diagram.sweep({"gain.gain": (1.0, 1.0)}, 0.1, seeds="dice.seed", signals="y", workers=1, **QUIET)
     assert not found.failures
