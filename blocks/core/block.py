@@ -128,8 +128,9 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
     quanta: ClassVar[Mapping[str, str]] = {}
     """Inputs that outputs follow in equal steps, as of a converter or an encoder, each with the parameter that holds
     the step's size. Linear models take such a block by its mean slope; other rounding only where it is asked for."""
-    same_units: ClassVar[bool] = False
-    """True where all inputs must be in one unit, as in a sum."""
+    same_units: ClassVar[bool | tuple[str, ...]] = False
+    """True where all inputs must be in one unit, as in a sum; or the names of those that must, as of a set-point and
+    a measured value."""
     converts_units: ClassVar[bool | None] = None
     """True where a wire to or from the block is converted if its ends are in different units of one dimension; False
     where the block's user could ask for that."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
@@ -265,26 +264,6 @@ def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
         return f"{a.text} and {b.text} differ by an offset of {offset:.12g}: give both in {b.base_text}"
     gain = f"{a.factor / b.factor:.12g}"
     return f"{a.text} and {b.text} differ by a factor of {gain}: put Gain(gain={gain}) between"
-
-
-def agreed_unit(
-    units: Mapping[str, str | tuple[str, ...] | None], first: str, second: str
-) -> str | tuple[str, ...] | None:
-    """Return the unit that two inputs of a block have, of its `output_units`; None where neither is known.
-
-    UnitError, at the second input: the units differ.
-    """
-    a, b = units[first], units[second]
-    if a is None or b is None:
-        return b if a is None else a
-    n = max(len(unit) if isinstance(unit, tuple) else 1 for unit in (a, b))
-    left, right = (unit if isinstance(unit, tuple) else (unit,) * n for unit in (a, b))
-    for expected, found in zip(left, right, strict=False):  # shapes are checked elsewhere
-        if not same_unit(found, expected):
-            raise UnitError(
-                f"expected {expected} as `{first}` next to it is: {describe_mismatch(found, expected)}", port=second
-            )
-    return a
 
 
 def combine_units(*factors: tuple[str, int]) -> str | None:

@@ -19,12 +19,9 @@ from ..core import (
     Kind,
     Output,
     ParameterError,
-    PortUnit,
     ShapeError,
     State,
-    Units,
     accepts,
-    agreed_unit,
     kinds,
     parameter,
     shape_of,
@@ -78,6 +75,7 @@ class StateFeedback(Block):
         For a state of another number of entries than K has columns, when the diagram is built.
     """
 
+    same_units = ("state", "target")
     gain: Array = parameter(
         kw_only=False, description="gain K, m × n; n numbers, or one row, make y a scalar", kind=_GAIN
     )
@@ -156,11 +154,6 @@ class StateFeedback(Block):
                 port="state",
             )
         return u.feedforward - (K @ off if rows else K * off)
-
-    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
-        """Refuse a target in other units than the state; the gain, which has none, hides that of y."""
-        agreed_unit(units, "state", "target")
-        return {}
 
 
 class _Observer(Block):

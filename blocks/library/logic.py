@@ -21,7 +21,6 @@ from ..core import (
     PortUnit,
     State,
     Units,
-    agreed_unit,
     check_shapes,
     kinds,
     parameter,
@@ -187,6 +186,7 @@ class Switch(Block):
         built.
     """
 
+    same_units = ("then", "otherwise")
     condition = Input(shape=None, description="logic signal")
     then = Input(shape=None, description="output while the condition is true, of any shape")
     otherwise = Input(shape=None, description="output while it is not, of the same shape or a scalar")
@@ -201,7 +201,7 @@ class Switch(Block):
 
     def output_units(self, units: Units) -> Mapping[str, PortUnit]:
         """Return the unit that both branches have."""
-        return {"y": agreed_unit(units, "then", "otherwise")}
+        return {"y": units["otherwise"] if units["then"] is None else units["then"]}
 
     def indicators(self, t: Array, x: Any, u: Any) -> Array:
         """Return the distance of the condition above 0.5."""

@@ -14,10 +14,7 @@ from ..core import (
     Input,
     Output,
     ParameterError,
-    PortUnit,
     State,
-    Units,
-    agreed_unit,
     clip,
     kinds,
     parameter,
@@ -66,6 +63,7 @@ class PID(Block):
     PID(kp=2, ki=4, kd=0.2, filter_time=0.01, lower=-1, upper=1)
     """
 
+    same_units = ("r", "y")
     kp: float = parameter(description="proportional gain")
     ki: float = parameter(default=0.0, description="integral gain, in 1/s times the unit of kp")
     kd: float = parameter(default=0.0, description="derivative gain, in s times the unit of kp")
@@ -171,11 +169,6 @@ class PID(Block):
         if self.tracks and self.tracking_time is None and self.ki and not self.kp / self.ki > 0:
             text = f"kp / ki is {self.kp / self.ki:g} s; expected a positive time. Give tracking_time."
             raise ParameterError(text, port="tracking_time")
-
-    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
-        """Refuse a set-point in another unit than the measured value; the gains, which have none, hide that of u."""
-        agreed_unit(units, "r", "y")
-        return {}
 
     @property
     def has_limits(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 
 from ...blocks.core import Block, PortUnit, UnitError, describe_mismatch, same_dimension, same_unit
@@ -56,13 +56,15 @@ def check_units(table: Structure) -> dict[Port, Unit]:
     units = follow_units(table, {})
     for path, block in sorted(table.blocks.items()):
         first: tuple[Wire, Unit] | None = None
-        for name, spec in block.inputs.items():
+        inputs = block.inputs
+        alike = _alike(block, inputs)
+        for name, spec in inputs.items():
             wire = table.wires.get((path, name))
             unit = None if wire is None else _part_unit(units, wire)
             if wire is None or unit is None:
                 continue
             expected, relation = spec.unit, "expected"
-            if block.same_units:
+            if name in alike:
                 if first is None:
                     first = (wire, unit)
                 expected, relation = first[1], f"{first[0]} next to it is"
@@ -119,8 +121,9 @@ def add_unit_conversions(table: Structure) -> Structure:
             block, unit = table.blocks[path], _part_unit(units, wire)
             if unit is None or not (block.converts_units or table.blocks[wire.block].converts_units):
                 continue
-            spec = inputs[path].get(port)
-            expected = _shared_unit(table, units, path) if block.same_units else None if spec is None else spec.unit
+            spec, alike = inputs[path].get(port), _alike(block, inputs[path])
+            declared = None if spec is None else spec.unit
+            expected = _shared_unit(table, units, path, alike) if port in alike else declared
             differing = [*_mismatches(unit, expected)]
             if differing and all(same_dimension(a, b) for a, b in differing):
                 fresh[path, port] = unit, expected
@@ -146,9 +149,14 @@ def _insert(table: Structure, conversions: Mapping[Port, tuple[Unit, Unit]]) -> 
     return table
 
 
-def _shared_unit(table: Structure, units: dict[Port, Unit], path: str) -> Unit:
-    """Return the unit that all inputs of a block get: of the first whose source does not convert, else of the first."""
-    wires = [table.wires[path, name] for name in table.blocks[path].inputs if (path, name) in table.wires]
+def _alike(block: Block, inputs: Collection[str]) -> Collection[str]:
+    """Return those of a block's inputs that must be in one unit."""
+    return block.same_units if isinstance(block.same_units, tuple) else inputs if block.same_units else ()
+
+
+def _shared_unit(table: Structure, units: dict[Port, Unit], path: str, alike: Collection[str]) -> Unit:
+    """Return the unit that such inputs get: of the first whose source does not convert, else of the first."""
+    wires = [table.wires[path, name] for name in alike if (path, name) in table.wires]
     known = [(wire, unit) for wire in wires if (unit := _part_unit(units, wire)) is not None]
     firm = [unit for wire, unit in known if not table.blocks[wire.block].converts_units]
     return firm[0] if firm else known[0][1] if known else None

@@ -186,7 +186,7 @@ def test_an_angle_in_a_product_counts_with_and_without_rad():
         (lambda: np.minimum(of("m"), of("mm")), r"differ by a factor of 0\.001"),
         (
             lambda: np.where(1.0 * of("m") > 0.0, of("m"), of("s")),
-            r"otherwise: constant_4\.y is in s; expected m as `then`",
+            r"otherwise: constant_4\.y is in s; constant_3\.y next to it is in m",
         ),
         (lambda: of("1") ** of("s"), r"u2: constant_2\.y is in s; expected 1, as np\.power takes a pure number as exp"),
         (lambda: np.arcsin(of("rad")), r"expected 1, as np\.arcsin"),

@@ -233,7 +233,7 @@ def test_a_set_point_in_another_unit_than_the_measured_value():
     """kp (r − y) of radians less degrees is a number, and a wrong one: the gain, which has no unit, can't show it."""
     measured, wish = Constant(value=1.0, unit="rad", name="measured"), Constant(value=30.0, unit="deg", name="wish")
     pid = PID(kp=1.0, name="pid")
-    text = r"^pid\.y: measured\.y is in rad; expected deg as `r` next to it is: .*put Gain\(gain=57\.295"
+    text = r"^pid\.y: measured\.y is in rad; wish\.y next to it is in deg: .*put Gain\(gain=57\.295"
     with pytest.raises(UnitError, match=text):
         Diagram("d", pid(wish, measured))
     Diagram("d", pid(Constant(value=0.5, unit="rad"), measured))
@@ -243,7 +243,7 @@ def test_a_set_point_in_another_unit_than_the_measured_value():
 def test_a_target_in_other_units_than_the_state():
     state, target = Constant(value=(1.0, 2.0), unit="m", name="at"), Constant(value=(30.0, 0.0), unit="mm", name="wish")
     feedback = StateFeedback(gain=(1.0, 2.0), name="feedback")
-    text = r"^feedback\.target: wish\.y is in mm; expected m as `state` next to it is: .*Gain\(gain=0\.001\)"
+    text = r"^feedback\.target: wish\.y is in mm; at\.y next to it is in m: .*Gain\(gain=0\.001\)"
     with pytest.raises(UnitError, match=text):
         Diagram("d", feedback(state, target))
     Diagram("d", feedback(state, (0.0, 0.0)))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, Gain, Input, Output, Sine, Sum, UnitConversion, UnitError
+from loopwright.blocks import PID, Block, Constant, Gain, Input, Output, Sine, Sum, UnitConversion, UnitError
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, mass_spring_damper
 from support.typed_fmus import typed_fmu
@@ -94,8 +94,10 @@ def test_outputs_are_converted_for_their_consumers_and_recorded_in_their_own_uni
     closed = wired(plant, T=Constant(value=300.0, unit="K"), F=Constant(value=10.0, unit="degC"))
     difference = Sum(signs="+-", name="difference")(Constant(value=30.0, unit="degC"), plant.y_T)
     twice = Sum(signs="++", name="mean")(plant.y_F, plant.y_T)  # both are of the FMU: in the first one's unit
-    run = Diagram("d", closed, difference, twice).simulate(0.1, step=0.1, progress=False)
+    loop = PID(kp=1.0, name="pid")(Constant(value=30.0, unit="degC", name="wish"), plant.y_T)
+    run = Diagram("d", closed, difference, twice, loop).simulate(0.1, step=0.1, progress=False)
     assert run["plant.y_T"][-1] == 300.0
+    assert run["pid.u"][-1] == pytest.approx(30.0 - 26.85, rel=1e-12)
     assert run.unit("plant.y_T") == "K"
     assert run["difference.y"][-1] == pytest.approx(30.0 - 26.85, rel=1e-12)
     assert run.unit("difference.y") == "degC"
