@@ -8,7 +8,7 @@ import numpy as np
 
 from ...blocks.core import ParameterError, accepts, kinds
 from .number import Number, carries_findings
-from .scan_refine_confirm import find_first_limit, number_of_limit
+from .scan_refine_confirm import Candidate, find_first_limit
 from .sensitivities import invert_loop
 from .state_space import Matrices, hold_inputs, make_state_space, read_matrices
 
@@ -123,4 +123,5 @@ def delayed_hold_margin(plant: LinearSystem, controller: LinearSystem, *, larges
     found = find_first_limit(radius, 0.0, (0.1 * T * k for k in range(1, int(10 * largest) + 1)))
     if found is None:
         return Number(np.inf, "s", 0.0, f"{how}: stable up to {largest:g} samples")
-    return number_of_limit("delayed_hold_margin", found, "s", 1e-10 * found, lambda delay: radius(delay) < 0, how)
+    limit = Candidate.of_limit("delayed_hold_margin", found, "s", 1e-10 * found, lambda delay: radius(delay) < 0, how)
+    return limit.confirmed()

@@ -127,6 +127,11 @@ class DelayedRealization:
         return np.array(found)
 
     @property
+    def gain_at_infinity(self) -> float:
+        """Largest |L| at infinite frequency."""
+        return float(np.max(np.abs(self.at_infinity)))
+
+    @property
     def D(self) -> np.ndarray:  # noqa: N802 - as of a realization
         """L at infinite frequency, shape (1, 1): of all values that it has there, the one nearest to −1 or beyond."""
         return np.array([[float(np.min(self.at_infinity))]])
@@ -318,8 +323,9 @@ class DelayedRealization:
         poles = self.open.plain_poles
         return split_axis_poles(self, poles, max(self.rounding_scale, float(np.abs(poles).max(initial=0.0))))
 
+    @cached_property
     def features(self) -> Features:
-        """Return poles, zeros and closed-loop poles, as far as they shape the response."""
+        """Poles, zeros and closed-loop poles, as far as they shape the response."""
         axis, poles = self._plain
         more, off = list[AxisPole](), list[complex]()
         for part in self.open.delayed:
@@ -363,7 +369,11 @@ def _poles_of(system: DelayMatrices) -> list[complex]:
     return [complex(p) for p in (*system.plain_poles, *(p for part in system.delayed for p in part.roots))]
 
 
-def realize(loop: Any, *, delay: int = 0) -> Realization | DelayedRealization:
+LoopModel = Realization | DelayedRealization
+"""A loop as scans and confirmations take it, with its response and its closed loop's poles."""
+
+
+def realize(loop: Any, *, delay: int = 0) -> LoopModel:
     """Return the realization of a loop, with delays or without."""
     # a loop itself is not asked, as it would look for near names; a linear model of a diagram has delays, and no inputs
     own = {*getattr(loop, "__dict__", ()), *dir(type(loop))}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,12 +20,11 @@ from ...blocks.core import (
     explain_calls,
     kinds,
 )
-from .delayed_margins import ByArgument
-from .delayed_realization import DelayedRealization, realize
+from .confirmations import ByArgument
+from .delayed_realization import DelayedRealization, LoopModel, realize
 from .loop_scan import LoopScan
 from .margin_analysis import EIGENVALUES
 from .number import Confirmation, Number, carries_findings
-from .poles_and_zeros import Features
 from .realization import Realization
 from .scan_refine_confirm import confirm_limit, find_largest
 from .sensitivity_peaks import confirm_peak, sensitivity_at
@@ -113,8 +112,7 @@ def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Dis
     ParameterError
         If the closed loop is not stable.
     """
-    r = realize(loop, delay=delay)
-    return _compute_delayed(r, skew) if isinstance(r, DelayedRealization) else _compute_disk_margin(r, skew)
+    return _compute_disk_margin(realize(loop, delay=delay), skew)
 
 
 @accepts(delay=kinds.finite, skew=kinds.number)
@@ -182,7 +180,18 @@ def factor(delta: np.ndarray | float, skew: float = 0.0) -> np.ndarray:
     return np.where(infinite, np.inf, (1 + (1 - skew) / 2 * delta) / np.where(infinite, 1.0, bottom))
 
 
-def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
+class _Worst(NamedTuple):
+    """The smallest perturbation that ends stability: its frequency in rad/s, a bound of its size, and one that does."""
+
+    omega: float
+    alpha: float
+    delta: np.ndarray  # one entry a channel
+    size: float  # of delta
+    how: str
+
+
+def _compute_disk_margin(r: LoopModel, skew: float) -> DiskMargin:
+    """Return the disk margin of a loop whose closed loop is stable."""
     n = len(r.D)
     if r.D.shape != (n, n):
         raise ParameterError(f"found a loop of shape {r.D.shape}; expected a square one.", block="disk_margin")
@@ -193,11 +202,31 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
             block="disk_margin",
         )
     if not r.is_stable():
+        every = "" if isinstance(r, DelayedRealization) else f" of {r.order}"
         raise ParameterError(
-            f"found {r.count_unstable()} of {r.order} closed-loop poles that are not stable; expected a stable closed "
+            f"found {r.count_unstable():g}{every} closed-loop poles that are not stable; expected a stable closed "
             "loop: this one has no margin. Look at margins(loop).closed_loop_poles.",
             block="disk_margin",
         )
+    found = _find_by_peak(r, skew) if isinstance(r, DelayedRealization) else _find_by_structured_value(r, skew)
+    omega, alpha = found.omega, found.alpha
+    is_end = omega in (0.0, np.inf) or omega == r.nyquist
+    low, high, phase = disk_gains(alpha, skew)
+    return DiskMargin(
+        alpha=Number(alpha, "1", alpha * max(1e-9, 3 * r.error(omega) if 0 < omega < np.inf else 0.0), found.how),
+        skew=skew,
+        frequency=Number(omega, "rad/s", 0.0 if is_end else 1e-4 * omega, found.how),
+        gain_low=low,
+        gain_high=high,
+        phase_deg=phase,
+        destabilizing=tuple(complex(f) for f in factor(found.delta, skew)),
+        destabilizing_alpha=found.size,
+    )
+
+
+def _find_by_structured_value(r: Realization, skew: float) -> _Worst:
+    """Return the worst perturbation of a loop without delays: the peak of μ, confirmed by its lower bound."""
+    n = len(r.D)
 
     def matrix(omega: float) -> np.ndarray:
         return sensitivity_at(r, omega) + (skew - 1) / 2 * np.eye(n)
@@ -220,46 +249,18 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
         how = how.and_by(confirm_peak(r, (1 + skew) / 2, -(1 - skew) / 2, bound, "disk_margin"))
     else:
         how = how.and_by(f"smallest perturbation found: {1 / lower:.9g}", "the smallest perturbation that was found")
-    low, high, phase = disk_gains(alpha, skew)
-    ends = omega in (0.0, np.inf) or omega == r.nyquist
-    return DiskMargin(
-        alpha=Number(alpha, "1", alpha * max(1e-9, 3 * r.error(omega) if 0 < omega < np.inf else 0.0), how),
-        skew=skew,
-        frequency=Number(omega, "rad/s", 0.0 if ends else 1e-4 * omega, how),
-        gain_low=low,
-        gain_high=high,
-        phase_deg=phase,
-        destabilizing=tuple(complex(f) for f in np.atleast_1d(factor(delta, skew))),
-        destabilizing_alpha=1 / lower,
-    )
+    return _Worst(omega, alpha, delta, 1 / lower, how)
 
 
-def _compute_delayed(r: DelayedRealization, skew: float) -> DiskMargin:
-    """Return the disk margin of a loop with delays and one channel."""
-    if not r.order or not r.is_stable():
-        raise ParameterError(
-            f"found {r.count_unstable():g} closed-loop poles that are not stable; expected a stable closed loop: this "
-            "one has no margin. Look at margins(loop).closed_loop_poles.",
-            block="disk_margin",
-        )
-    by, upper, lower = ByArgument(r), (1 + skew) / 2, -(1 - skew) / 2
-    peak = by.scan.find_peak(upper, lower)
-    how = by.confirm_peak(upper, lower, peak, "disk_margin")
-    alpha, inside = 1 / peak.value, 0.0 < peak.omega < np.inf
-    L = next((value for end, value in by.scan.ends() if end == peak.omega), None)
+def _find_by_peak(r: DelayedRealization, skew: float) -> _Worst:
+    """Return the worst perturbation of a loop with delays and one channel: the peak of one transfer function."""
+    scan, upper, lower = LoopScan.of(r), (1 + skew) / 2, -(1 - skew) / 2
+    peak = scan.find_peak(upper, lower)
+    how = ByArgument(r).confirm_peak(upper, lower, peak, "disk_margin")
+    L = next((value for end, value in scan.ends() if end == peak.omega), None)
     L = complex(r.matrix(np.array([1j * peak.omega]))[0, 0, 0]) if L is None else L
     M = complex(lower if np.isinf(L) else (upper + lower * L) / (1 + L))
-    low, high, phase = disk_gains(alpha, skew)
-    return DiskMargin(
-        alpha=Number(alpha, "1", alpha * max(1e-9, 3 * r.error(peak.omega) if inside else 0.0), how),
-        skew=skew,
-        frequency=Number(peak.omega, "rad/s", 1e-4 * peak.omega if inside else 0.0, how),
-        gain_low=low,
-        gain_high=high,
-        phase_deg=phase,
-        destabilizing=tuple(complex(f) for f in factor(np.array([1 / M]), skew)),
-        destabilizing_alpha=alpha,
-    )
+    return _Worst(peak.omega, 1 / peak.value, np.array([1 / M]), 1 / peak.value, how)
 
 
 def disk_gains(alpha: float, skew: float = 0.0) -> tuple[float, float, float]:
@@ -304,7 +305,7 @@ def _find_largest(r: Realization, skew: float, matrix: Callable[[float], np.ndar
 
 def _make_grid(r: Realization) -> np.ndarray:
     """Return frequencies around all open-loop and closed-loop poles, further 20 a decade, and both ends."""
-    features = Features.of(r)
+    features = r.features
     sizes = features.sizes()
     low, high = (sizes[0] / 1e3, sizes[-1] * 1e3) if len(sizes) else (1e-3, 1e3)
     high = min(high, r.nyquist)

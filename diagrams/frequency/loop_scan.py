@@ -1,20 +1,22 @@
-"""Frequency response of a loop with one channel, scanned: its crossings and peaks, refined as roots."""
+"""Frequency response of a loop with one channel, scanned: its crossings and peaks, refined as roots.
+
+One with delays has crossings without end. The scan has those down to a size of |L|, below which none decides a margin.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .poles_and_zeros import SIDES, Features
+from .poles_and_zeros import SIDES
 from .scan_refine_confirm import refine_sign_change
 
 if TYPE_CHECKING:
-    from .delayed_realization import DelayedRealization
-    from .realization import Realization
+    from .delayed_realization import LoopModel
 
 Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From L and dL/d(log ω) to a value and its slope over log ω."""
@@ -30,6 +32,8 @@ NARROWINGS = 12
 """Halvings of the steps in which they lie."""
 POLISHED = 20
 """Number of candidates of a peak that are refined."""
+FLOORS = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-6, 1e-9)
+"""|L| above which all turns that delays make are resolved; tried until a phase crossover lies between it and 1."""
 
 
 @dataclass(frozen=True)
@@ -161,14 +165,29 @@ class _Search:
 class LoopScan:
     """Frequency response of a loop with one channel, sampled once; crossings and peaks are refined from the samples."""
 
-    def __init__(self, r: Realization | DelayedRealization, features: Features | None = None, *, floor: float = 0.0):
-        self.r = r
-        self.features = features if features is not None else Features.of(cast("Realization", r))
-        self.floor = floor
-        self.segments = make_grid(r, self.features, floor=floor)
+    def __init__(self, r: LoopModel, *, floor: float = 0.0):
+        self.r, self.features, self.floor = r, r.features, floor
+        self.segments = make_grid(r, floor=floor)
         if floor:
             self.segments = _leave_small(r, self.segments, 0.5 * floor)
         self.samples = [self._response(omega) for omega in self.segments]
+
+    @classmethod
+    def of(cls, r: LoopModel) -> LoopScan:
+        """Return the scan of a loop; of one with delays down to a size of |L| below which no crossing decides."""
+        if not r.late:
+            return cls(r)
+        size = 1.0
+        if not any(a.omega == 0.0 for a in r.features.axis_poles):  # L(0) may be 0: of a washout, of a cancelled delay
+            bends = np.append(0.0, np.abs(r.features.points()))
+            size = float(np.clip(np.max(np.abs(r.matrix(1j * bends)[:, 0, 0])), 1e-3, 1.0))
+        for part in FLOORS:
+            scan = cls(r, floor=part * size)
+            if np.isfinite(r.settled) or any(scan.floor <= abs(c.L) < 1.0 for c in scan.phase_crossovers):
+                break  # one that turns up to infinite frequency is scanned as far as it changes
+            if all(np.all(np.abs(L) > scan.floor) for L, _ in scan.samples):
+                break  # a lower floor leads to the same samples
+        return scan
 
     def find_gain_crossovers(self) -> list[Crossing]:
         """Return the crossings of |L| = 1 by rising frequency, the ends of the axis included."""
@@ -321,9 +340,7 @@ class LoopScan:
         return float(np.exp(refine_sign_change(lambda x: function(np.exp(x)), low, high, xtol=1e-14)))
 
 
-def make_grid(
-    r: Realization | DelayedRealization, features: Features, *, delay: float = 0.0, floor: float = 0.0
-) -> list[np.ndarray]:
+def make_grid(r: LoopModel, *, delay: float = 0.0, floor: float = 0.0) -> list[np.ndarray]:
     """Return segments of frequencies in rad/s that resolve every pole and zero, cut at those on the axis.
 
     The grid has 40 points a decade, and more around each pole and zero in proportion to its distance from the axis. It
@@ -332,6 +349,7 @@ def make_grid(
     left out, with a delay in series below 0.3.
     """
     floor = max(floor, TURNS_MATTER) if delay else floor
+    features = r.features
     sizes = features.sizes()
     low, high = (sizes[0] / 1e4, sizes[-1] * 1e4) if len(sizes) else (1e-3, 1e3)
     high = r.nyquist if r.dt else min(high, r.settled)
@@ -358,7 +376,7 @@ def make_grid(
     return segments
 
 
-def _leave_small(r: Realization | DelayedRealization, segments: list[np.ndarray], size: float) -> list[np.ndarray]:
+def _leave_small(r: LoopModel, segments: list[np.ndarray], size: float) -> list[np.ndarray]:
     """Return segments without the frequencies behind the last at which |L| is above a size, and one more."""
     last = [np.flatnonzero(np.abs(r.matrix(1j * omega)[:, 0, 0]) > size) for omega in segments]
     most = max((k for k, found in enumerate(last) if found.size), default=0)
@@ -366,7 +384,7 @@ def _leave_small(r: Realization | DelayedRealization, segments: list[np.ndarray]
     return [*segments[:most], segments[most][:end]]
 
 
-def _bisect(r: Realization | DelayedRealization, omega: np.ndarray, delay: float, floor: float) -> np.ndarray:
+def _bisect(r: LoopModel, omega: np.ndarray, delay: float, floor: float) -> np.ndarray:
     def respond(at: np.ndarray) -> np.ndarray:
         return np.asarray(r.matrix(1j * at)[:, 0, 0] * np.exp(-1j * at * delay))
 

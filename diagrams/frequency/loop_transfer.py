@@ -411,7 +411,7 @@ def _frequencies(loop: Any) -> np.ndarray:
     if _is_measured(loop):
         return np.asarray(loop.omega, dtype=float)
     if isinstance(loop, DelayedSystem):
-        return _between_crossings(loop, DelayedRealization.of(loop).features().sizes(), 0.0)
+        return _between_crossings(loop, DelayedRealization.of(loop).features.sizes(), 0.0)
     dt = float(loop.dt or 0.0)
     marks = np.abs(np.concatenate([np.ravel(loop.poles()), np.ravel(loop.zeros())]))
     if dt:

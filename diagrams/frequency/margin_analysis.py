@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
 from ...blocks.core import Finding, Grid, Sheet, ShownAsTable, brief, decibels, explain_calls, missing_member
-from .delayed_realization import DelayedRealization
+from .delayed_realization import LoopModel
 from .number import MARK, NOT_IN_DATA, Interval, Number
-from .realization import Realization
-from .scan_refine_confirm import number_of_limit
+from .scan_refine_confirm import Candidate
 
 EIGENVALUES = "closed-loop eigenvalues"
 NEAR = 1e-12
@@ -140,7 +139,7 @@ Found = TypeVar("Found", bound=StabilityMargins)
 
 
 class MarginFinder(ABC, Generic[Found]):
-    """An analysis of a closed loop. A subclass scans and refines; the limits are confirmed here."""
+    """An analysis of a closed loop. A subclass scans and refines; the numbers are confirmed here."""
 
     result: type[Any]
     """Class of the result, `Found`."""
@@ -148,20 +147,20 @@ class MarginFinder(ABC, Generic[Found]):
     """Computation that says whether a closed loop is stable."""
     rotated: ClassVar[str] = " with L rotated"
 
-    def __init__(self, r: Realization | DelayedRealization):
+    def __init__(self, r: LoopModel):
         self.r: Any = r
         self.unstable: float = r.count_unstable()
 
     @abstractmethod
-    def find_numbers(self) -> dict[str, Number]:
-        """Return the numbers of a stable loop by name, confirmed."""
+    def find_candidates(self) -> dict[str, Candidate]:
+        """Return the numbers of a stable loop by name, scanned and refined."""
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
         """Return the further fields of the result, which an unstable loop has as well."""
 
     def find_margins(self) -> Found:
-        """Return the margins; those of an unstable loop are NaN."""
+        """Return the margins, confirmed; those of an unstable loop are NaN."""
         r = self.r
         poles = r.eigenvalues()
         if self.unstable:
@@ -171,7 +170,7 @@ class MarginFinder(ABC, Generic[Found]):
             names = [f.name for f in fields(self.result) if f.type == "Number"]
             found = {name: Number(np.nan, MARGIN_UNITS.get(name, "1"), np.nan, reason) for name in names}
         else:
-            found = self.find_numbers()
+            found = {name: candidate.confirmed() for name, candidate in self.find_candidates().items()}
         made: Found = self.result(
             stable=not self.unstable,
             closed_loop_poles=tuple(complex(p) for p in np.sort_complex(poles + 1 if r.dt else poles)),
@@ -182,16 +181,14 @@ class MarginFinder(ABC, Generic[Found]):
         )
         return made
 
-    def make_gain_margin(
+    def limit_gain(
         self, name: str, factor: float, tolerance: float, *, others: Sequence[float] = (), tried: Sequence[float]
-    ) -> Number:
+    ) -> Candidate:
         """Return a gain margin; 0 or infinite where no factor ends stability."""
-        number = number_of_limit(
-            name, factor, "1", tolerance, self.r.is_stable, self.eigenvalues, nominal=1.0, others=others, tried=tried
-        )
-        return replace(number, is_gain=True)
+        options: dict[str, Any] = {"nominal": 1.0, "others": others, "tried": tried, "is_gain": True}
+        return Candidate.of_limit(name, factor, "1", tolerance, self.r.is_stable, self.eigenvalues, **options)
 
-    def make_phase_margin(self, degrees: float, tolerance: float, *, others: Sequence[float] = ()) -> Number:
+    def limit_rotation(self, degrees: float, tolerance: float, *, others: Sequence[float] = ()) -> Candidate:
         """Return the phase margin; infinite where no rotation ends stability."""
 
         def stable(degrees: float) -> bool:
@@ -200,4 +197,4 @@ class MarginFinder(ABC, Generic[Found]):
         how = self.eigenvalues + (self.rotated if np.isfinite(degrees) else "")
         others = [*others, *(360 - o for o in (degrees, *others))]  # the same limits, reached by the other direction
         name = "phase_margin_deg"
-        return number_of_limit(name, degrees, "deg", tolerance, stable, how, others=others, tried=ROTATIONS)
+        return Candidate.of_limit(name, degrees, "deg", tolerance, stable, how, others=others, tried=ROTATIONS)

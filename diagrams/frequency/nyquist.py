@@ -17,11 +17,10 @@ from ...blocks.core import (
     explain_calls,
     kinds,
 )
-from .delayed_realization import DelayedRealization, realize
+from .delayed_realization import LoopModel, realize
 from .loop_scan import TURNS_MATTER, make_grid
 from .number import carries_findings
-from .poles_and_zeros import Features, find_hidden_unstable, tell_hidden_unstable
-from .realization import Realization
+from .poles_and_zeros import find_hidden_unstable, tell_hidden_unstable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -104,14 +103,12 @@ def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
       Z = N + P        1 unstable poles of the closed loop
       hidden_unstable  1: not in this loop, and not moved by feedback around it
     """
-    r = realize(loop, delay=delay)
-    return count_encirclements(r, r.features() if isinstance(r, DelayedRealization) else Features.of(r))
+    return count_encirclements(realize(loop, delay=delay))
 
 
-def count_encirclements(r: Realization | DelayedRealization, features: Features) -> NyquistCount:
+def count_encirclements(r: LoopModel) -> NyquistCount:
     """Count the encirclements of a realization; see `nyquist_count`."""
-    closed = r.count_unstable()
-    found = r.count_open() if isinstance(r, DelayedRealization) else features.unstable_poles()
+    closed, found = r.count_unstable(), r.count_open()
     if np.isinf(closed) or np.isinf(found):
         raise ConfirmationError(
             "found ways around the delays without a state whose gain is 1 or more; expected less: there are infinitely "
@@ -127,9 +124,9 @@ def count_encirclements(r: Realization | DelayedRealization, features: Features)
             "a little, or look at margins(loop).closed_loop_poles.",
             block="nyquist",
         )
-    n = winding_number(r, features)
+    n = winding_number(r)
     if n + open_loop != eigenvalues:
-        how = "eigenvalues" if isinstance(r, Realization) else "roots of the characteristic function"
+        how = "roots of the characteristic function" if r.late else "eigenvalues"
         raise ConfirmationError(
             f"found {n} clockwise encirclements of −1 and {open_loop} unstable open-loop poles, but {eigenvalues} "
             f"unstable {how} of the closed loop; expected Z = N + P. Look at closed_loop_poles: one may lie on "
@@ -140,7 +137,7 @@ def count_encirclements(r: Realization | DelayedRealization, features: Features)
     return NyquistCount(n, open_loop + len(hidden), eigenvalues + len(hidden), hidden)
 
 
-def winding_number(r: Realization | DelayedRealization, features: Features, *, delay: float = 0.0) -> int:
+def winding_number(r: LoopModel, *, delay: float = 0.0) -> int:
     """Return the clockwise encirclements of 0 by 1 + L e^(−sτ) along the limit of stability.
 
     A sampled loop takes a delay τ of whole samples.
@@ -148,7 +145,7 @@ def winding_number(r: Realization | DelayedRealization, features: Features, *, d
     Only the upper half of the contour is followed: the lower one is its mirror image. The contour passes each pole on
     the axis by a half-circle to the right, smaller than the distance to any other pole, zero or closed-loop pole.
     """
-    turning = bool(delay) or not isinstance(r, Realization)
+    turning = delay + r.late > 0.0
     if len(r.D) != 1:
         raise ParameterError(f"found a loop of {len(r.D)} channels; expected one. Open a single wire.", block="nyquist")
     if turning and not r.dt and abs(r.D[0, 0]) >= 1:
@@ -157,7 +154,7 @@ def winding_number(r: Realization | DelayedRealization, features: Features, *, d
             "end. Leave the delay out.",
             block="nyquist",
         )
-    path = _make_contour(r, features, delay)
+    path = _make_contour(r, delay)
     total, last = 0.0, 0j
     for s in path:
         values = _follow_loop(r, s, delay)
@@ -177,10 +174,10 @@ def winding_number(r: Realization | DelayedRealization, features: Features, *, d
     return round(turns)
 
 
-def _make_contour(r: Realization | DelayedRealization, features: Features, delay: float) -> list[np.ndarray]:
+def _make_contour(r: LoopModel, delay: float) -> list[np.ndarray]:
     """Return the upper half of the contour as lines and arcs of points s."""
-    turning = bool(delay) or not isinstance(r, Realization)
-    segments = make_grid(r, features, delay=delay, floor=TURNS_MATTER if turning else 0.0)
+    features, turning = r.features, delay + r.late > 0.0
+    segments = make_grid(r, delay=delay, floor=TURNS_MATTER if turning else 0.0)
     others = np.concatenate([features.poles, features.closed, features.zeros])
     spots = [a.omega for a in features.axis_poles]
     top = segments[-1][-1]
@@ -217,7 +214,7 @@ def _make_contour(r: Realization | DelayedRealization, features: Features, delay
     return path + ([1j * line] if len(line) else [])
 
 
-def _follow_loop(r: Realization | DelayedRealization, s: np.ndarray, delay: float) -> NDArray[np.complex128]:
+def _follow_loop(r: LoopModel, s: np.ndarray, delay: float) -> NDArray[np.complex128]:
     """Return 1 + L e^(−s delay) along points, bisected until it turns by less than 0.5 rad from one to the next."""
     for _ in range(30):
         f: NDArray[np.complex128] = 1 + r.matrix(s)[:, 0, 0] * np.exp(-s * delay)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from .margin_analysis import MarginFinder, StabilityMargins
 from .number import Confirmation, Number, carries_findings
 from .poles_and_zeros import SIDES
 from .realization import Realization
-from .scan_refine_confirm import find_first_limit, find_largest, first_largest
+from .scan_refine_confirm import Candidate, find_first_limit, find_largest, first_largest
 from .sensitivity_peaks import confirm_peak, sensitivity_at
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def periodic_margins(loop: LinearSystem) -> PeriodicMargins:
 
 
 class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
-    """Factors that destabilize a lifted loop, on a grid of θ; each ``_find_…`` computes and confirms margins."""
+    """Factors that destabilize a lifted loop, on a grid of θ; each ``_find_…`` returns margins as candidates."""
 
     result = PeriodicMargins
     eigenvalues = EIGENVALUES
@@ -179,7 +179,7 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
         """S = (I + L)⁻¹ at the angles of the grid, shape (angles, n, n)."""
         return sensitivity_at(self.r, self.theta / self.r.dt)
 
-    def find_numbers(self) -> dict[str, Number]:  # noqa: D102 - as in the base
+    def find_candidates(self) -> dict[str, Candidate]:  # noqa: D102 - as in the base
         disk, self.factor = self._find_disk_margin()
         limits = {**self._find_gain_margins(), **self._find_phase_margin(), **self._find_delay_margin()}
         return {**limits, **disk, **self._find_peaks()}
@@ -215,21 +215,21 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
 
         return find_first_limit(growth, begin, steps())
 
-    def _find_gain_margins(self) -> dict[str, Number]:
+    def _find_gain_margins(self) -> dict[str, Candidate]:
         found = {}
         for name, none, end in (("gain_margin_low", 0.0, -1.0), ("gain_margin_high", np.inf, 1.0)):
             x = self._find_limit(lambda x: complex(np.exp(x)), 0.0, end * np.log(LARGEST))
             k = none if x is None else float(np.exp(x))
             tried = [float(v) for v in LARGEST ** (end * np.linspace(0.1, 1.0, 10))]
-            found[name] = self.make_gain_margin(name, k, 1e-9 * k, tried=tried)
+            found[name] = self.limit_gain(name, k, 1e-9 * k, tried=tried)
         return found
 
-    def _find_phase_margin(self) -> dict[str, Number]:
+    def _find_phase_margin(self) -> dict[str, Candidate]:
         x = self._find_limit(lambda x: complex(np.exp(1j * x)), 0.0, np.pi)
         degrees = np.inf if x is None else float(np.degrees(x))
-        return {"phase_margin_deg": self.make_phase_margin(degrees, 1e-7)}
+        return {"phase_margin_deg": self.limit_rotation(degrees, 1e-7)}
 
-    def _find_delay_margin(self) -> dict[str, Number]:
+    def _find_delay_margin(self) -> dict[str, Candidate]:
         n, delayed, T = 0, _delay_by_a_renewal(self.r), self.r.dt / len(self.r.D)
         while n < RENEWALS and delayed.is_stable():
             n, delayed = n + 1, _delay_by_a_renewal(delayed)
@@ -247,8 +247,8 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
             samples = seconds = np.nan
         error = np.nan if np.isnan(samples) else 0.0
         return {
-            "delay_margin_samples": Number(samples, "samples", error, how),
-            "delay_margin_s": Number(seconds, "s", error, how),
+            "delay_margin_samples": Candidate.known(samples, "samples", error, how),
+            "delay_margin_s": Candidate.known(seconds, "s", error, how),
         }
 
     def _is_small(self) -> bool:
@@ -259,7 +259,7 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
         except np.linalg.LinAlgError:  # a pole on the limit, such as an integrator's: the loop is unbounded there
             return False
 
-    def _find_disk_margin(self) -> tuple[dict[str, Number], complex]:
+    def _find_disk_margin(self) -> tuple[dict[str, Candidate], complex]:
         def reach(s: np.ndarray) -> float:
             """Return the largest |s − 1/2|, 1/α of the factors of an angle: (f + 1)/(f − 1) = 2 s − 1."""
             return float(np.max(np.abs(s - 0.5), initial=0.0))
@@ -269,16 +269,14 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
         values = self.sensitivities(theta)
         s = complex(values[first_largest(np.abs(values - 0.5))])
         alpha, factor = 1 / largest, s / (s - 1.0)
-        how = self._confirm_disk(alpha, factor, theta)
-        low, high, phase = disk_gains(alpha, 0.0)
-        how = how.and_by(f"gains {low:.6g} … {high:.6g} and phases up to ± {phase:.6g}° may vary together", "")
+        confirm = cache(partial(self._confirm_disk, alpha, factor, theta))
         return {
-            "disk_margin": Number(alpha, "1", 1e-8 * alpha, how),
-            "disk_frequency": Number(theta / self.r.dt, "rad/s", 1e-3 * theta / self.r.dt, how),
+            "disk_margin": Candidate(alpha, "1", 1e-8 * alpha, confirm),
+            "disk_frequency": Candidate(theta / self.r.dt, "rad/s", 1e-3 * theta / self.r.dt, confirm),
         }, factor
 
-    def _find_peaks(self) -> dict[str, Number]:
-        """Return the largest singular values of the lifted S and T, confirmed by Hamiltonian eigenvalues."""
+    def _find_peaks(self) -> dict[str, Candidate]:
+        """Return the largest singular values of the lifted S and T."""
         found = {}
         for name, a, b in (("ms", 1.0, 0.0), ("mt", 0.0, 1.0)):
 
@@ -289,16 +287,18 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
                 return float(gain(sensitivity_at(self.r, theta / self.r.dt)))
 
             value, _ = find_largest(gain_at, self.theta, gain(self.on_grid))
-            found[name] = Number(value, "1", 1e-8 * value, confirm_peak(self.r, a, b, value, name))
+            confirm = cache(partial(confirm_peak, self.r, a, b, value, name))
+            found[name] = Candidate(value, "1", 1e-8 * value, confirm)
         ms = found["ms"]
-        modulus = Number(1 / ms.value, "1", ms.tolerance / ms.value**2, ms.confirmed_by)
-        return {"modulus_margin": modulus, **found}
+        return {"modulus_margin": Candidate(1 / ms.value, "1", ms.tolerance / ms.value**2, ms.confirm), **found}
 
     def _confirm_disk(self, alpha: float, factor: complex, theta: float) -> Confirmation:
         """Confirm a disk margin by eigenvalues around the rim and at the factor; return the computation."""
         delta = 2 * (factor - 1) / (factor + 1)
+        low, high, phase = disk_gains(alpha, 0.0)
+        together = f"gains {low:.6g} … {high:.6g} and phases up to ± {phase:.6g}° may vary together"
         if np.isclose(alpha, 2.0, rtol=1e-12) or abs(2 - delta) < 1e-9:
-            return Confirmation("the loop's factors: one of them is 0 or infinite")
+            return Confirmation("the loop's factors: one of them is 0 or infinite").and_by(together, "")
 
         def at(d: complex) -> complex:
             return (1 + d / 2) / (1 - d / 2)
@@ -319,7 +319,7 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
         return Confirmation(
             f"{EIGENVALUES}: stable at {len(inner)} factors of {1 - INSIDE:g} α, unstable at {1 + INSIDE:g} α, "
             "a pole on the limit at the factor itself"
-        )
+        ).and_by(together, "")
 
 
 def _moved(s: np.ndarray) -> np.ndarray:

@@ -3,49 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .realization import Realization
-
 if TYPE_CHECKING:
     from control import StateSpace
+
+    from .delayed_realization import LoopModel
+    from .realization import Realization
 
 SIDES = np.array([-10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10])
 """Distances from a pole or zero, in parts of its distance from the axis, at which a scan has frequencies."""
 GAP = 2e-9
 """Relative distance that a scan keeps from a single pole or zero on the axis."""
-
-
-class Poles(Protocol):
-    """Poles of a `Realization`, or of one with delays: a protocol, as the latter imports this file."""
-
-    @property
-    def dt(self) -> float:
-        """Sample time in s, 0 of a continuous system."""
-
-    @property
-    def nyquist(self) -> float:
-        """Highest frequency in rad/s."""
-
-    def growth(self, p: np.ndarray) -> np.ndarray:
-        """Return the distance of poles beyond the limit of stability."""
-
-    def logarithm(self, p: np.ndarray) -> np.ndarray:
-        """Return s at points of the plane."""
-
-    @property
-    def hidden(self) -> np.ndarray:
-        """The hidden poles in the plane."""
-
-    @property
-    def hidden_errors(self) -> np.ndarray:
-        """How far rounding may have moved each."""
-
-    @property
-    def rounding_scale(self) -> float:
-        """Size to which the rounding of the poles is relative."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +80,7 @@ class Features:
 
 
 def split_axis_poles(
-    r: Poles, p: np.ndarray, scale: float, errors: np.ndarray | None = None
+    r: LoopModel, p: np.ndarray, scale: float, errors: np.ndarray | None = None
 ) -> tuple[tuple[AxisPole, ...], np.ndarray]:
     """Split poles into those on the limit of stability, with coinciding ones gathered, and the others, all as s.
 
@@ -207,7 +178,7 @@ def finite_zeros(system: StateSpace) -> np.ndarray:
     return np.asarray(zeros[np.abs(zeros) < 1e3 * far])
 
 
-def find_hidden_unstable(r: Poles) -> tuple[complex, ...]:
+def find_hidden_unstable(r: LoopModel) -> tuple[complex, ...]:
     """Return the hidden poles beyond the limit, in the planes of s or z.
 
     Coinciding poles on the limit scatter to both sides and are left out.

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, ParameterError
 from .number import explain_singular
+from .poles_and_zeros import Features
 from .state_space import inexactness_of, read_coefficients, read_matrices
 from .transfer_functions import Coefficients
 
@@ -120,6 +121,11 @@ class Realization:
     def end_error(self) -> float:
         """Relative error of L at infinite frequency, D."""
         return 1e-15
+
+    @property
+    def gain_at_infinity(self) -> float:
+        """|L| of a loop with one channel at infinite frequency."""
+        return abs(float(self.D[0, 0]))
 
     def point(self, s: np.ndarray) -> np.ndarray:
         """Return p at points s."""
@@ -233,6 +239,15 @@ class Realization:
         part, second = _split_uncontrollable(_transpose(part))
         part = replace(_transpose(part), turned=whole.rounding_scale)
         return whole._replace_by(part, np.hstack([first, second]))
+
+    @cached_property
+    def features(self) -> Features:
+        """Poles, zeros and closed-loop poles, which shape the response."""
+        return Features.of(self)
+
+    def count_open(self) -> int:
+        """Return the number of poles of L beyond the limit of stability; those on it are not counted."""
+        return self.features.unstable_poles()
 
     def grid(self, low: float, high: float, count: int) -> np.ndarray:
         """Return frequencies in rad/s to draw a response at: ``count`` over the logarithm, and more at resonances."""

@@ -1,12 +1,14 @@
 """Limits and peaks over one quantity: seen in a scan, refined, and confirmed by a computation that shares neither.
 
 All margins are found in these three steps. A scan is a list of values at rising places; the refinement searches between
-two of them; a confirmation evaluates stability on both sides of the result.
+two of them; the result is a `Candidate`. Its confirmation evaluates stability on both sides, and makes it a `Number`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -148,25 +150,50 @@ def confirm_no_limit(name: str, values: Sequence[float], stable: Callable[[float
     return Confirmation(text, method)
 
 
-def number_of_limit(
-    name: str,
-    value: float,
-    unit: str,
-    tolerance: float,
-    stable: Callable[[float], bool],
-    how: str,
-    *,
-    nominal: float = 0.0,
-    others: Sequence[float] = (),
-    tried: Sequence[float] = (),
-) -> Number:
-    """Return a limit of stability as a confirmed number.
+@dataclass(frozen=True)
+class Candidate:
+    """A number that was scanned and refined, with the computation that will confirm it.
 
-    ``value``: the limit; 0 or infinite where none was found, so that stability is confirmed at the values of ``tried``.
-    ``stable``: whether the loop is stable at a value, by a computation other than the scan; ``how`` names it.
-    ``nominal``: value at which the loop is stable, as it is.
-    ``others``: further limits, which the tests on both sides stay clear of.
+    ``confirm`` returns what agreed, and raises `ConfirmationError` where nothing does.
     """
-    if value in (0.0, np.inf):
-        return Number(value, unit, 0.0, confirm_no_limit(name, tried, stable, how))
-    return Number(value, unit, tolerance, confirm_limit(name, value, others, nominal, stable, how))
+
+    value: float
+    unit: str
+    tolerance: float
+    confirm: Callable[[], str]
+    is_gain: bool = False
+
+    @classmethod
+    def of_limit(
+        cls,
+        name: str,
+        value: float,
+        unit: str,
+        tolerance: float,
+        stable: Callable[[float], bool],
+        how: str,
+        *,
+        nominal: float = 0.0,
+        others: Sequence[float] = (),
+        tried: Sequence[float] = (),
+        is_gain: bool = False,
+    ) -> Candidate:
+        """Return a limit of stability.
+
+        ``value``: the limit; 0 or infinite where none was found, so that stability is confirmed at values of ``tried``.
+        ``stable``: whether the loop is stable at a value, by a computation other than the scan; ``how`` names it.
+        ``nominal``: value at which the loop is stable, as it is.
+        ``others``: further limits, which the tests on both sides stay clear of.
+        """
+        if value in (0.0, np.inf):
+            return cls(value, unit, 0.0, partial(confirm_no_limit, name, tried, stable, how), is_gain)
+        return cls(value, unit, tolerance, partial(confirm_limit, name, value, others, nominal, stable, how), is_gain)
+
+    @classmethod
+    def known(cls, value: float, unit: str, tolerance: float, how: str) -> Candidate:
+        """Return a number that needs no further computation; ``how`` says what makes it certain, or why it is NaN."""
+        return cls(value, unit, tolerance, lambda: how)
+
+    def confirmed(self) -> Number:
+        """Return the number, confirmed."""
+        return Number(self.value, self.unit, self.tolerance, self.confirm(), is_gain=self.is_gain)

@@ -571,9 +571,9 @@ def test_only_crossings_that_may_decide_are_refined_of_a_response_that_passes_ze
     roots = [brentq(lambda w: L(w).imag, w[i], w[i + 1], xtol=1e-15) for i in k]
     expected = [root for root in roots if L(root).real <= -floor]
     r = realize(predictor_of_a_lag(known))
-    features, response = r.features(), DelayedRealization.response
+    response = DelayedRealization.response
     monkeypatch.setattr(DelayedRealization, "response", lambda r, w: calls.append(np.size(w)) or response(r, w))
-    found = [c for c in LoopScan(r, features, floor=floor).phase_crossovers if abs(c.L) >= floor]
+    found = [c for c in LoopScan(r, floor=floor).phase_crossovers if abs(c.L) >= floor]
     np.testing.assert_allclose([c.omega for c in found], expected, rtol=1e-9)
     np.testing.assert_allclose([c.L.real for c in found], [L(root).real for root in expected], rtol=1e-8)
     assert crossings is None or len(found) == crossings

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from loopwright.blocks import LoopwrightError, ParameterError
 from loopwright.diagrams import ConfirmationError
-from loopwright.diagrams.frequency import loop_margins, loop_scan, scan_refine_confirm
+from loopwright.diagrams.frequency import confirmations, loop_scan, scan_refine_confirm
 from loopwright.diagrams.frequency.loop_scan import LoopScan
 from loopwright.diagrams.frequency.realization import Realization
 from loopwright.diagrams.frequency.sensitivity_peaks import confirm_peak
@@ -322,7 +322,7 @@ def test_a_scan_that_goes_wrong_is_an_error(what, monkeypatch):
         monkeypatch.setattr(loop_scan.LoopScan, f"find_{what}_crossovers", off)
     elif what == "delay":
         real = loop_scan.LoopScan.find_gain_crossovers
-        monkeypatch.setattr(loop_margins, "_confirm_crossing", lambda *_: "")
+        monkeypatch.setattr(confirmations.ByEigenvalues, "confirm_crossing", lambda *_: "")
         monkeypatch.setattr(
             loop_scan.LoopScan,
             "find_gain_crossovers",
@@ -466,7 +466,7 @@ def test_a_delay_margin_of_exactly_one_sample_is_confirmed():
     assert found.delay_margin_s.value == pytest.approx(0.1, abs=1e-13)
     assert "on the limit at n = 1" in found.delay_margin_samples.confirmed_by
     with pytest.raises(ConfirmationError, match="no closed-loop pole is nearer"):
-        loop_margins._confirm_on_limit(Realization.of(control.tf([0.9], [1.0, -1.0], 0.1)), 1)
+        confirmations.ByEigenvalues(Realization.of(control.tf([0.9], [1.0, -1.0], 0.1))).confirm_on_limit(1)
 
 
 @pytest.mark.parametrize(("dt", "pole"), [(0, 2.0), (0.1, 1.2)])

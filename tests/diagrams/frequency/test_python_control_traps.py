@@ -8,7 +8,6 @@ import pytest
 
 from loopwright.blocks import ParameterError
 from loopwright.diagrams.frequency.loop_scan import make_grid
-from loopwright.diagrams.frequency.poles_and_zeros import Features
 from loopwright.diagrams.frequency.python_control_margins import _Judge, compare_margins, respond_at_once
 from loopwright.diagrams.frequency.realization import Realization
 from loopwright.frequency import compare_with_control, disk_margin, margins, nyquist_count, place
@@ -121,11 +120,11 @@ def test_spurious_crossings_at_low_frequency_are_not_taken_for_margins():
 
 def test_three_scattered_poles_at_one_are_one_cluster_below_which_nothing_is_read():
     r = Realization.of(with_rounding(20.0))
-    features = Features.of(r)
+    features = r.features
     assert [(a.omega, a.multiplicity) for a in features.axis_poles] == [(0.0, 3)]
     assert features.axis_poles[0].scatter > 1e-3  # rad/s, where a triple pole is exact in the original matrices
     assert features.unstable_poles() == 0
-    assert make_grid(r, features)[0][0] >= 30 * features.axis_poles[0].scatter
+    assert make_grid(r)[0][0] >= 30 * features.axis_poles[0].scatter
 
 
 def test_its_polynomial_method_finds_a_gain_margin_of_two_where_there_are_sixteen_hundred():
