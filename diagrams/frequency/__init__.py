@@ -10,6 +10,7 @@ from .delayed_realization import realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .loop_drawing import DrawnLoop, draw_bode_axes, draw_nyquist_axes, phase_of
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins, scan_margins
+from .loop_model import find_hidden_unstable
 from .margin_analysis import MARGIN_UNITS
 from .margin_slopes import MarginSlope, margin_slopes
 from .measured_margins import MeasuredMargins, measured_margins, read_frequency_data
@@ -18,7 +19,7 @@ from .nyquist import NyquistCount, nyquist_count
 from .periodic_margins import PeriodicMargins, periodic_margins
 from .pole_maps import plot_poles
 from .pole_placement import place, relative_difference
-from .poles_and_zeros import find_hidden_unstable, finite_zeros
+from .poles_and_zeros import finite_zeros
 from .python_control_margins import Comparison, compare_margins, compare_with_control
 from .realization import Realization
 from .sampled_design import SampledDesign, sampled_gains, sampled_poles

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...blocks.core import ConfirmationError
 from .delayed_realization import DelayedRealization
-from .loop_scan import Crossing, LoopScan, Peak
+from .loop_scan import Crossing, Peak
 from .margin_analysis import EIGENVALUES
 from .number import Confirmation
 from .nyquist import winding_number
@@ -247,6 +247,6 @@ class ByArgument:
         return self.r.put_late(tau).is_stable()
 
 
-def confirmations_of(scan: LoopScan) -> ByEigenvalues | ByArgument:
-    """Return what confirms the candidates of a scan."""
-    return ByArgument(scan.r) if isinstance(scan.r, DelayedRealization) else ByEigenvalues(scan.r)
+def confirmations_of(r: Realization | DelayedRealization) -> ByEigenvalues | ByArgument:
+    """Return what confirms the candidates of a loop's scan."""
+    return ByArgument(r) if isinstance(r, DelayedRealization) else ByEigenvalues(r)

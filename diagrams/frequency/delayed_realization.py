@@ -11,7 +11,8 @@ import numpy as np
 
 from ...blocks.core import ParameterError
 from .delay_matrices import MARGINAL, DelayMatrices, sort_rightmost
-from .poles_and_zeros import AxisPole, Features, split_axis_poles, transmission_zeros
+from .loop_model import LoopModel
+from .poles_and_zeros import AxisPole, Features, split_axis_poles
 from .realization import ROUNDOFF, Realization
 
 if TYPE_CHECKING:
@@ -36,11 +37,11 @@ MOST_SIGNS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class DelayedRealization:
+class DelayedRealization(LoopModel):
     """A continuous loop with one channel: a rest with the delays τ closed around its last inputs and outputs.
 
-    The interface is that of `Realization`, as far as scans and confirmations of one channel need it. ``hidden`` are
-    the poles that input or output doesn't see, with ``hidden_errors`` how far rounding may have moved each.
+    ``hidden`` are the poles that input or output doesn't see, with ``hidden_errors`` how far rounding may have moved
+    each.
     """
 
     rest: Realization
@@ -50,8 +51,6 @@ class DelayedRealization:
     name: str = "loop"
 
     dt = 0.0
-    nyquist = np.inf
-    coefficients = None
 
     @classmethod
     def of(cls, loop: DelayedSystem, *, delay: int = 0) -> DelayedRealization:
@@ -131,8 +130,8 @@ class DelayedRealization:
         """Largest |L| at infinite frequency."""
         return float(np.max(np.abs(self.at_infinity)))
 
-    @property
-    def D(self) -> np.ndarray:  # noqa: N802 - as of a realization
+    @cached_property
+    def D(self) -> np.ndarray:  # type: ignore[override]  # noqa: N802 - a field of a realization
         """L at infinite frequency, shape (1, 1): of all values that it has there, the one nearest to −1 or beyond."""
         return np.array([[float(np.min(self.at_infinity))]])
 
@@ -195,18 +194,6 @@ class DelayedRealization:
         """Size to which the rounding of the poles is relative."""
         return self.rest.rounding_scale
 
-    def point(self, s: np.ndarray) -> np.ndarray:
-        """Return the points themselves: the plane is that of s."""
-        return np.asarray(s, dtype=complex)
-
-    def logarithm(self, p: np.ndarray) -> np.ndarray:
-        """Return the points themselves."""
-        return self.point(p)
-
-    def growth(self, p: np.ndarray) -> np.ndarray:
-        """Return the distance of poles beyond the limit of stability, Re s."""
-        return np.asarray(np.real(p))
-
     # --- response -----------------------------------------------------------------------------------------------------
 
     def _equations(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -241,10 +228,6 @@ class DelayedRealization:
         late[:, self.rest.order :] *= -self.tau
         L = self.rest.D[0, 0] + np.sum(c * v[:, :, 0], axis=1)
         return np.asarray(L), np.asarray(slope * (np.sum(late * v[:, :, 0], axis=1) - np.sum(c * moved, axis=1)))
-
-    def response(self, omega: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """Return L and dL/dω at the frequencies ω."""
-        return self.values(1j * np.atleast_1d(np.asarray(omega, dtype=float)), slope=1j)
 
     def error(self, omega: float) -> float:
         """Return an estimate of the relative error of L at ω: the difference to the adjoint solution."""
@@ -301,10 +284,6 @@ class DelayedRealization:
             return np.inf
         return self.close(factor).count_unstable()
 
-    def is_stable(self, factor: complex = 1.0) -> bool:
-        """Whether all closed-loop poles are stable."""
-        return self.count_unstable(factor) == 0
-
     def find_marginal(self) -> np.ndarray:
         """Return the closed-loop poles that are on the limit of stability, up to rounding."""
         system = self.close()
@@ -351,7 +330,7 @@ class DelayedRealization:
 
         r = self.rest
         rest = ss(r.A, r.B, r.C, r.D, 0, remove_useless_states=False)
-        return transmission_zeros(Realization.of(DelayedSystem(rest, self.tau).pade(ZEROS_ORDER)))
+        return Realization.of(DelayedSystem(rest, self.tau).pade(ZEROS_ORDER)).zeros()
 
     def count_open(self) -> float:
         """Return the number of poles of L beyond the limit of stability; those on it are not counted."""
@@ -369,11 +348,7 @@ def _poles_of(system: DelayMatrices) -> list[complex]:
     return [complex(p) for p in (*system.plain_poles, *(p for part in system.delayed for p in part.roots))]
 
 
-LoopModel = Realization | DelayedRealization
-"""A loop as scans and confirmations take it, with its response and its closed loop's poles."""
-
-
-def realize(loop: Any, *, delay: int = 0) -> LoopModel:
+def realize(loop: Any, *, delay: int = 0) -> Realization | DelayedRealization:
     """Return the realization of a loop, with delays or without."""
     # a loop itself is not asked, as it would look for near names; a linear model of a diagram has delays, and no inputs
     own = {*getattr(loop, "__dict__", ()), *dir(type(loop))}

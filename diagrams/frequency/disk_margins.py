@@ -21,7 +21,7 @@ from ...blocks.core import (
     kinds,
 )
 from .confirmations import ByArgument
-from .delayed_realization import DelayedRealization, LoopModel, realize
+from .delayed_realization import DelayedRealization, realize
 from .loop_scan import LoopScan
 from .margin_analysis import EIGENVALUES
 from .number import Confirmation, Number, carries_findings
@@ -190,7 +190,7 @@ class _Worst(NamedTuple):
     how: str
 
 
-def _compute_disk_margin(r: LoopModel, skew: float) -> DiskMargin:
+def _compute_disk_margin(r: Realization | DelayedRealization, skew: float) -> DiskMargin:
     """Return the disk margin of a loop whose closed loop is stable."""
     n = len(r.D)
     if r.D.shape != (n, n):

@@ -20,12 +20,13 @@ from ...blocks.core import (
     on_one_thread,
 )
 from .confirmations import confirmations_of
-from .delayed_realization import LoopModel, realize
+from .delayed_realization import DelayedRealization, realize
+from .loop_model import LoopModel, find_hidden_unstable, tell_hidden_unstable
 from .loop_scan import Crossing, LoopScan, Peak
 from .margin_analysis import MarginFinder, StabilityMargins
 from .number import Number, carries_findings
 from .nyquist import count_encirclements
-from .poles_and_zeros import find_hidden_unstable, tell_hidden_unstable
+from .realization import Realization
 from .scan_refine_confirm import Candidate
 from .state_space import findings_of
 
@@ -223,10 +224,10 @@ class _LoopMarginFinder(MarginFinder[Margins]):
 
     result = Margins
 
-    def __init__(self, r: LoopModel, skew: float):
+    def __init__(self, r: Realization | DelayedRealization, skew: float):
         super().__init__(r)
         self.skew, self.scan = skew, LoopScan.of(r)
-        self.by: Any = confirmations_of(self.scan)
+        self.by: Any = confirmations_of(r)
         self.eigenvalues = self.by.stability
         self.gain = self.scan.find_gain_crossovers()
         self.phase = [c for c in self.scan.phase_crossovers if abs(c.L) >= self.scan.floor]
@@ -345,8 +346,8 @@ class _LoopMarginFinder(MarginFinder[Margins]):
             found[name + "_frequency"] = Candidate(peak.omega, "rad/s", error, confirm)
         ms = found["ms"]
         found["modulus_margin"] = Candidate(1 / ms.value, "1", ms.tolerance / ms.value**2, ms.confirm)
-        confirm = partial(self.by.confirm_peak, upper, lower, disk, "disk_margin")
-        found["disk_margin"] = Candidate(1 / disk.value, "1", self._error(disk, t) / disk.value, confirm)
+        of_disk = partial(self.by.confirm_peak, upper, lower, disk, "disk_margin")
+        found["disk_margin"] = Candidate(1 / disk.value, "1", self._error(disk, t) / disk.value, of_disk)
         return {**found, "bandwidth": self._find_bandwidth()}
 
     def _error(self, peak: Peak, t: Peak) -> float:
@@ -371,14 +372,14 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         return Candidate(omega, "rad/s", 1e-10 * omega, partial(self.by.confirm_bandwidth, omega, level))
 
 
-def scan_margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> dict[str, Candidate]:
-    """Return the margins of a loop with one channel but for those of delay, without a confirmation.
+def scan_margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> dict[str, float]:
+    """Return the values of the margins of a loop with one channel but for those of delay, which nothing confirms.
 
     They are for comparisons: a number of many that are compared with one that is confirmed. Those of an unstable loop
     are none. Arguments and errors are those of `margins`.
     """
     finder = _LoopMarginFinder(realize(loop, delay=delay), skew)
-    return {} if finder.unstable else finder.find_without_delay()
+    return {} if finder.unstable else {name: found.value for name, found in finder.find_without_delay().items()}
 
 
 def find_disk_frequency(r: LoopModel, skew: float = 0.0) -> float:

@@ -16,7 +16,7 @@ from .poles_and_zeros import SIDES
 from .scan_refine_confirm import refine_sign_change
 
 if TYPE_CHECKING:
-    from .delayed_realization import LoopModel
+    from .loop_model import LoopModel
 
 Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From L and dL/d(log ω) to a value and its slope over log ω."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from ...blocks.core import Finding, Grid, Sheet, ShownAsTable, brief, decibels, explain_calls, missing_member
-from .delayed_realization import LoopModel
+from .loop_model import LoopModel
 from .number import MARK, NOT_IN_DATA, Interval, Number
 from .scan_refine_confirm import Candidate
 

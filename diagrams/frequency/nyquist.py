@@ -17,10 +17,10 @@ from ...blocks.core import (
     explain_calls,
     kinds,
 )
-from .delayed_realization import LoopModel, realize
+from .delayed_realization import realize
+from .loop_model import LoopModel, find_hidden_unstable, tell_hidden_unstable
 from .loop_scan import TURNS_MATTER, make_grid
 from .number import carries_findings
-from .poles_and_zeros import find_hidden_unstable, tell_hidden_unstable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -10,13 +10,45 @@ import numpy as np
 if TYPE_CHECKING:
     from control import StateSpace
 
-    from .delayed_realization import LoopModel
-    from .realization import Realization
-
 SIDES = np.array([-10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10])
 """Distances from a pole or zero, in parts of its distance from the axis, at which a scan has frequencies."""
 GAP = 2e-9
 """Relative distance that a scan keeps from a single pole or zero on the axis."""
+
+
+class PolePlane:
+    """The plane of a system's poles p: that of s, or of z − 1 where it is sampled.
+
+    The shift keeps poles accurate far below the sampling frequency. Points s lie at p = exp(s T) − 1.
+    """
+
+    dt: float
+
+    @property
+    def nyquist(self) -> float:
+        """Highest frequency of the response in rad/s: π/T, or infinity."""
+        return np.pi / self.dt if self.dt else np.inf
+
+    def point(self, s: np.ndarray) -> np.ndarray:
+        """Return p at points s."""
+        return np.asarray(np.expm1(s * self.dt) if self.dt else s, dtype=complex)
+
+    def logarithm(self, p: np.ndarray) -> np.ndarray:
+        """Return s at points p; −∞ for z = 0."""
+        p = np.asarray(p, dtype=complex)
+        if not self.dt:
+            return p
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # log|1 + p| without cancellation near p = 0
+            real = 0.5 * np.log1p(np.maximum(2 * p.real + np.abs(p) ** 2, -1.0))
+            return np.asarray((real + 1j * np.angle(1 + p)) / self.dt)
+
+    def growth(self, p: np.ndarray) -> np.ndarray:
+        """Return the distance of poles beyond the limit of stability: Re s, or |z| − 1."""
+        if not self.dt:
+            return np.asarray(np.real(p))
+        square = 2 * np.real(p) + np.abs(p) ** 2
+        return np.asarray(square / (1 + np.sqrt(1 + square)))
 
 
 @dataclass(frozen=True)
@@ -49,18 +81,6 @@ class Features:
     zeros: np.ndarray
     closed: np.ndarray
 
-    @classmethod
-    def of(cls, r: Realization) -> Features:
-        """Return the features of a loop, found by eigenvalues."""
-        axis_poles, poles = split_axis_poles(r, np.linalg.eigvals(r.A), r.rounding_scale)
-        zeros = transmission_zeros(r)
-        axis_zeros, zeros = split_axis_poles(r, zeros, max(r.scale, float(np.abs(zeros).max(initial=0.0))))
-        try:
-            closed = r.logarithm(r.eigenvalues())
-        except np.linalg.LinAlgError:
-            closed = np.zeros(0)
-        return cls(axis_poles, poles, axis_zeros, zeros, closed[np.isfinite(closed)])
-
     def unstable_poles(self) -> int:
         """Return the number of open-loop poles beyond the limit of stability; those on it are not counted."""
         return int(np.sum(self.poles.real > 0))
@@ -80,7 +100,7 @@ class Features:
 
 
 def split_axis_poles(
-    r: LoopModel, p: np.ndarray, scale: float, errors: np.ndarray | None = None
+    plane: PolePlane, p: np.ndarray, scale: float, errors: np.ndarray | None = None
 ) -> tuple[tuple[AxisPole, ...], np.ndarray]:
     """Split poles into those on the limit of stability, with coinciding ones gathered, and the others, all as s.
 
@@ -100,27 +120,27 @@ def split_axis_poles(
                 mean = complex(group.mean())
                 spread = float(np.max(np.abs(group - mean)))
                 explained = all(abs(left[k] - mean) <= allowed[k] for k in near)
-                if spread <= radius and explained and abs(float(r.growth(np.array(mean)))) <= 1e-11 * scale:
+                if spread <= radius and explained and abs(float(plane.growth(np.array(mean)))) <= 1e-11 * scale:
                     left, allowed = ([v for k, v in enumerate(of) if k not in near] for of in (left, allowed))
                     found.append((mean, m, spread))
                     again = True
                     break
     axis = []
     for mean, m, spread in found:
-        s = complex(r.logarithm(np.array(mean)))
+        s = complex(plane.logarithm(np.array(mean)))
         omega = abs(s.imag)
-        rate = 1 / r.dt if r.dt else 1.0
+        rate = 1 / plane.dt if plane.dt else 1.0
         if omega <= 1e-9 * scale * rate + 3 * spread * rate:
             omega = 0.0
-        if r.dt and abs(omega - r.nyquist) <= 1e-9 * r.nyquist:
-            omega = r.nyquist
-        if s.imag >= 0 or omega in (0.0, r.nyquist):
+        if plane.dt and abs(omega - plane.nyquist) <= 1e-9 * plane.nyquist:
+            omega = plane.nyquist
+        if s.imag >= 0 or omega in (0.0, plane.nyquist):
             axis.append(AxisPole(omega, m, max(spread, 1e-15 * scale) * rate))
-    rest = r.logarithm(np.array(left, dtype=complex))
+    rest = plane.logarithm(np.array(left, dtype=complex))
     return tuple(sorted(axis, key=lambda a: a.omega)), rest[np.isfinite(rest)]
 
 
-def transmission_zeros(r: Realization) -> np.ndarray:
+def transmission_zeros(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> np.ndarray:
     """Return the zeros of a loop with one channel, in the plane of p.
 
     Zeros at infinity scatter by rounding to some 1e15^(1/k) times the poles, k of them together. How many of them there
@@ -128,17 +148,17 @@ def transmission_zeros(r: Realization) -> np.ndarray:
     """
     from scipy.linalg import eig
 
-    n = r.order
-    if not n or len(r.D) != 1 or not (finite := n - count_zeros_at_infinity(r.A, r.B, r.C, r.D)):
+    n = len(A)
+    if not n or len(D) != 1 or not (finite := n - count_zeros_at_infinity(A, B, C, D)):
         return np.zeros(0)
-    b, c = np.linalg.norm(r.B) or 1.0, np.linalg.norm(r.C) or 1.0
-    pencil = np.block([[r.A, r.B / b], [r.C / c, r.D / (b * c)]])
+    b, c = np.linalg.norm(B) or 1.0, np.linalg.norm(C) or 1.0
+    pencil = np.block([[A, B / b], [C / c, D / (b * c)]])
     alpha, beta = eig(pencil, np.diag([1.0] * n + [0.0]), right=False, homogeneous_eigvals=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         zeros = alpha / beta
     zeros = zeros[np.isfinite(zeros)]
     zeros = zeros[np.argsort(np.abs(zeros), kind="stable")[:finite]]
-    return np.asarray(zeros[np.abs(zeros) < 1e6 * max(r.scale, 1e-300)])
+    return np.asarray(zeros[np.abs(zeros) < 1e6 * max(float(np.linalg.norm(A)), 1e-300)])
 
 
 def count_zeros_at_infinity(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> int:
@@ -176,28 +196,3 @@ def finite_zeros(system: StateSpace) -> np.ndarray:
     if abs(degree - round(degree)) < 0.05:  # poles and zeros of the size of A bend the slope by some 1e-3 each
         return np.asarray(zeros[: max(len(A) - round(degree), 0)])
     return np.asarray(zeros[np.abs(zeros) < 1e3 * far])
-
-
-def find_hidden_unstable(r: LoopModel) -> tuple[complex, ...]:
-    """Return the hidden poles beyond the limit, in the planes of s or z.
-
-    Coinciding poles on the limit scatter to both sides and are left out.
-    """
-    if not len(r.hidden):
-        return ()
-    scale = max(r.rounding_scale, float(np.abs(r.hidden).max()))
-    _, rest = split_axis_poles(r, r.hidden, scale, r.hidden_errors)
-    beyond = rest[rest.real > 0]
-    if r.dt:
-        beyond = np.exp(beyond * r.dt)
-        is_real = np.abs(beyond.imag) <= 1e-15 * np.abs(beyond)  # a negative one has the angle π, whose sine rounds
-        beyond = np.where(is_real, beyond.real, beyond)
-    return tuple(complex(p) for p in beyond)
-
-
-def tell_hidden_unstable(poles: tuple[complex, ...]) -> list[tuple[str, str]]:
-    """Return the fact of a table that names hidden unstable poles, as `find_hidden_unstable` returns them."""
-    if not poles:
-        return []
-    named = ", ".join(f"{p:.6g}" if p.imag else f"{p.real:.6g}" for p in poles)
-    return [("hidden_unstable", f"{named}: not in this loop, and not moved by feedback around it")]

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import LoopwrightError, ParameterError
+from .loop_model import LoopModel
 from .number import explain_singular
-from .poles_and_zeros import Features
+from .poles_and_zeros import Features, split_axis_poles, transmission_zeros
 from .state_space import inexactness_of, read_coefficients, read_matrices
 from .transfer_functions import Coefficients
 
@@ -37,15 +38,14 @@ LARGE = 1e4
 
 
 @dataclass(frozen=True, eq=False)
-class Realization:
+class Realization(LoopModel):
     """A linear system (p I − A) x = B u, y = C x + D u with p = s, or p = z − 1 where it is sampled.
 
-    The shift z − 1 keeps a loop accurate far below the sampling frequency, where several poles at z = 1 would cancel
-    all digits. Frequencies and points of the contour are given as s in both cases: p = exp(s T) − 1. ``hidden`` are
-    the poles, in the plane of p, that the reduction has removed, and ``hidden_errors`` how far rounding may have moved
-    each. ``coefficients`` are those of the transfer function in z that was realized. ``inexactness`` is the relative
-    error of the entries as they were given. ``turned`` is the norm of the matrix that the reduction has turned into
-    this A and a hidden part, 0 where it has turned none: its rounding is in A, which may be much smaller.
+    Without the shift z − 1 several poles at z = 1 would cancel all digits far below the sampling frequency. ``hidden``
+    are the poles, in the plane of p, that the reduction has removed, and ``hidden_errors`` how far rounding may have
+    moved each. ``coefficients`` are those of the transfer function in z that was realized. ``inexactness`` is the
+    relative error of the entries as they were given. ``turned`` is the norm of the matrix that the reduction has turned
+    into this A and a hidden part, 0 where it has turned none: its rounding is in A, which may be much smaller.
     """
 
     A: np.ndarray
@@ -103,11 +103,6 @@ class Realization:
         return len(self.A)
 
     @property
-    def nyquist(self) -> float:
-        """Highest frequency of the response in rad/s: π/T, or infinity."""
-        return np.pi / self.dt if self.dt else np.inf
-
-    @property
     def late(self) -> float:
         """0: poles and zeros make all turns of the response."""
         return 0.0
@@ -127,28 +122,9 @@ class Realization:
         """|L| of a loop with one channel at infinite frequency."""
         return abs(float(self.D[0, 0]))
 
-    def point(self, s: np.ndarray) -> np.ndarray:
-        """Return p at points s."""
-        return np.asarray(np.expm1(s * self.dt) if self.dt else s, dtype=complex)
-
-    def logarithm(self, p: np.ndarray) -> np.ndarray:
-        """Return s at points p; −∞ for z = 0."""
-        p = np.asarray(p, dtype=complex)
-        if not self.dt:
-            return p
-        with np.errstate(divide="ignore", invalid="ignore"):
-            # log|1 + p| without cancellation near p = 0
-            real = 0.5 * np.log1p(np.maximum(2 * p.real + np.abs(p) ** 2, -1.0))
-            return np.asarray((real + 1j * np.angle(1 + p)) / self.dt)
-
     def matrix(self, s: np.ndarray) -> np.ndarray:
         """Return the transfer matrix at the points s, shape (..., outputs, inputs)."""
         return np.asarray(self.D + self.C @ self._states(np.atleast_1d(s)))
-
-    def response(self, omega: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """Return L and dL/dω of a loop with one channel at the frequencies ω."""
-        s = 1j * np.atleast_1d(np.asarray(omega, dtype=float))
-        return self.values(s, slope=1j)
 
     def values(self, s: np.ndarray, slope: complex = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Return L and ``slope`` times dL/ds of a loop with one channel at the points s."""
@@ -184,13 +160,6 @@ class Realization:
         """Return the closed-loop poles in the plane of p; see `closed_matrix`."""
         return np.linalg.eigvals(self.closed_matrix(factor))
 
-    def growth(self, p: np.ndarray) -> np.ndarray:
-        """Return the distance of poles beyond the limit of stability: Re s, or |z| − 1."""
-        if not self.dt:
-            return np.asarray(np.real(p))
-        square = 2 * np.real(p) + np.abs(p) ** 2
-        return np.asarray(square / (1 + np.sqrt(1 + square)))
-
     def count_unstable(self, factor: complex | np.ndarray = 1.0) -> int:
         """Return the number of closed-loop poles that are not stable; poles on the limit, up to rounding, count."""
         poles = self.eigenvalues(factor)
@@ -208,10 +177,6 @@ class Realization:
     def _marginal(self, poles: np.ndarray) -> float:
         """Return the rounding of closed-loop poles: they are differences of numbers as large as the open-loop poles."""
         return MARGINAL * max(self._largest_pole, float(np.abs(poles).max(initial=0.0)))
-
-    def is_stable(self, factor: complex | np.ndarray = 1.0) -> bool:
-        """Whether all closed-loop poles are stable."""
-        return self.count_unstable(factor) == 0
 
     @cached_property
     def scale(self) -> float:
@@ -243,7 +208,18 @@ class Realization:
     @cached_property
     def features(self) -> Features:
         """Poles, zeros and closed-loop poles, which shape the response."""
-        return Features.of(self)
+        axis_poles, poles = split_axis_poles(self, np.linalg.eigvals(self.A), self.rounding_scale)
+        zeros = self.zeros()
+        axis_zeros, zeros = split_axis_poles(self, zeros, max(self.scale, float(np.abs(zeros).max(initial=0.0))))
+        try:
+            closed = self.logarithm(self.eigenvalues())
+        except np.linalg.LinAlgError:
+            closed = np.zeros(0)
+        return Features(axis_poles, poles, axis_zeros, zeros, closed[np.isfinite(closed)])
+
+    def zeros(self) -> np.ndarray:
+        """Return the zeros of a loop with one channel."""
+        return transmission_zeros(self.A, self.B, self.C, self.D)
 
     def count_open(self) -> int:
         """Return the number of poles of L beyond the limit of stability; those on it are not counted."""

@@ -24,10 +24,10 @@ def compared_numbers(L: Any, names: Iterable[str], delay: int = 0, skew: float =
     """
     names = list(names)
     if L.ninputs > 1 or any(name.startswith("delay_margin") for name in names):
-        found = numbers_of(L, delay, skew)
+        found = {name: number.value for name, number in numbers_of(L, delay, skew).items()}
     else:
         found = scan_margins(L, delay=delay, skew=skew)
-    return {name: found[name].value if name in found else math.nan for name in names}
+    return {name: found.get(name, math.nan) for name in names}
 
 
 def write_open_loop(wire: str, quantity: str, at: object = None) -> str:

@@ -592,7 +592,7 @@ def test_of_many_crossings_those_that_can_not_decide_are_left_out(monkeypatch):
     at = L(w)
     k = np.flatnonzero((at.imag[1:] * at.imag[:-1] < 0) & (at.real[1:] < 0))
     largest = max(-L(brentq(lambda w: L(w).imag, w[i], w[i + 1], xtol=1e-15)).real for i in k)
-    assert scan_margins(loop)["gain_margin_high"].value == pytest.approx(1 / largest, rel=1e-9)
+    assert scan_margins(loop)["gain_margin_high"] == pytest.approx(1 / largest, rel=1e-9)
     assert len(k) > 200
     assert len(calls) < 2000
 
