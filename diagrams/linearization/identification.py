@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import FmuError, Layout, identity
-from ...fmus.calls import LoadedFmu
-from ...fmus.running import Derivation, DerivativeMethod, RestoredPoint, setup_of
+from ...fmus.running import Derivation, DerivativeMethod, RestoredPoint, open_to_step, setup_of, take_step
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
@@ -155,7 +154,7 @@ class _Runner:
         self.inputs = {variables[port].name: np.array(v, dtype=float) for port, v in point["inputs"].items()}
         self.start = {n: v for n, v in point["state"].items() if self.about.find(n).initial == "exact"}
         self.outputs = [v.name for v in block.output_variables.values()]
-        self.instance = LoadedFmu(setup_of(block))
+        self.instance = open_to_step(setup_of(block))
         self._steps, self._fresh = 0, True
         names = [*dict.fromkeys([*self.inputs, *self.outputs, *self.about.states])]
         self.rest = RestoredPoint(self.instance, names, self._start_at_rest)
@@ -176,13 +175,12 @@ class _Runner:
 
     def step(self) -> np.ndarray:
         """Step once, and return the outputs."""
-        t, final = self.t0 + self._k * self.h, not self.rest.is_restored
-        if self.instance.call(f"a step by {self.h:g} s", self.instance.fmi.do_step, t, self.h, final):
-            raise FmuError(
-                f"found a step of {self.h:g} s from t = {t:.9g} s that it ends early, or in which it asks to end the "
-                "simulation (terminateSimulation); expected whole steps. Take a smaller step, or another point.",
-                block=self.block.label,
-            )
+        t = self.t0 + self._k * self.h
+        refusal = (
+            f"found a step of {self.h:g} s from t = {t:.9g} s that it ends early, or in which it asks to end the "
+            "simulation (terminateSimulation); expected whole steps. Take a smaller step, or another point."
+        )
+        take_step(self.instance, t, self.h, refusal)
         self._k += 1
         return self.instance.values(self.outputs)
 

@@ -390,47 +390,9 @@ class FmiCalls(ABC):
         found = getattr(self.fmu, question)(kind)
         return getattr(found, "value", found)
 
-    def do_step(self, t: float, h: float, final: bool) -> bool:
-        """Take a step from t over h, both in s, with its events; return whether it ended early or ends the run."""
-        now, width, flag, call = self._bare_step
-        end, flag.value = t + h, final
-        for _ in range(MOST_ROUNDS):
-            now.value, width.value, call.any_flag.value = t, h, 0
-            status, ends = self.end_step(call.function(*call.arguments))
-            if ends:
-                return True
-            if status > WARNING:
-                raise call_error_type()(function=f"{self.prefix}DoStep", status=ctypes.c_int(status).value)
-            event, terminate, early, _ = call.flags
-            if event and self.event_mode_used and not terminate:
-                self.enter_event_mode()
-                self.settle_events()
-            if terminate or not early or not self.early_return_allowed:
-                return bool(terminate or early)
-            t, h = call.reached.value, end - call.reached.value
-            if h <= 1e-9 * (end - t + h):
-                return False
-        return True
-
-    @property
-    def _bare_step(self) -> tuple[ctypes.c_double, ctypes.c_double, Any, StepCall]:
-        """Time, length and flag of a step, and its call; made once for an instance."""
-        if self._made_step is None or self._made_step[0] != self.fmu.component:
-            now, width, flag = self.variable(ctypes.c_double), self.variable(ctypes.c_double), self.final
-            self._made_step = self.fmu.component, (now, width, flag, self.step_call(now, width, flag))
-        return self._made_step[1]
-
-    _made_step: tuple[Any, tuple[ctypes.c_double, ctypes.c_double, Any, StepCall]] | None = None
-
     def enter_step_mode(self) -> None:
         """Go back from Event Mode to Step Mode (FMI 3.0, 4.2.1)."""
         self.fmu.enterStepMode()
-
-    def settle_events(self) -> None:
-        """Go through the event iteration of an FMU in Event Mode, and back to Step Mode."""
-        if self.iterate_events().again:
-            raise RuntimeError(f"the events don't settle in {MOST_ROUNDS} rounds")
-        self.enter_step_mode()
 
     def iterate_events(self) -> EventUpdate:
         """Take rounds of the event iteration, and return what the last one says: ``again`` if they don't settle."""

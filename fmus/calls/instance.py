@@ -42,6 +42,8 @@ class FmuInstance(LoadedFmu):
         super().__init__(setup, wired)
         self.states, self._outcome = SavedStates(self), StepOutcome(self)
         self._step: InstanceStep | None = None
+        n, m = (sum(v.size for v in ports.values()) for ports in (self.inputs, setup.output_variables))
+        self._vectors = np.zeros(n), np.zeros(m)
         self.read = lambda t: None
         self._starts: dict[tuple[str, ...], BoundStart | None] = {}
 
@@ -52,11 +54,16 @@ class FmuInstance(LoadedFmu):
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Bind the vectors of the inputs to set and of the outputs to get, and get the outputs once."""
+        self._bind(inputs, outputs)
+        self.read(self._began)
+
+    def _bind(self, inputs: np.ndarray, outputs: np.ndarray) -> InstanceStep:
+        self._vectors = inputs, outputs
         self._step = step = InstanceStep(self, self.states, self._outcome, inputs, outputs)
         self.step, self.start_step, self.finish_step = step.function(), step.start, step.finish
         self.judge_native, self.finish_remote = step.judge_native, step.finish_native
         self.exchange, self.read = step.exchange, step.read
-        self.read(self._began)
+        return step
 
     @property
     def native(self) -> NativeStep | None:
@@ -85,9 +92,22 @@ class FmuInstance(LoadedFmu):
         with self.host if self._start is None else nullcontext():
             super().begin()
             self._outcome.set_span(self._began, 0.0)
+            if self.fmi.event_mode_used:  # it is in Event Mode now
+                (self._step or self._bind(*self._vectors)).begin(self._began)
             self.read(self._began)
             if self.record.variables:
                 self.begin_texts(self._began)
+
+    def reset(self) -> None:
+        """Return to the state before the initialization; steps are bound again to an instance that was made again."""
+        if not self.is_built_here:
+            self.states.close()
+        super().reset()
+        self.states.final.value = not self.states.handles  # no earlier state is left to go back to
+        if self._step is not None and self.is_built_here:
+            self._step.forget()
+        elif self._step is not None:
+            self._bind(*self._vectors)
 
     def start_again(self, values: Mapping[str, np.ndarray]) -> None:
         """Reset it, set start values and enter Initialization Mode at t = 0, as `reset` and `initialize` do.
@@ -100,8 +120,6 @@ class FmuInstance(LoadedFmu):
             Start values besides those of the block, which they override, by the FMU's names.
         """
         self.reset()
-        if self._step is not None:
-            self._step.forget()
         given = {**self.setup.start, **values}
         if (names := tuple(given)) not in self._starts:
             fits = self.is_built_here and self.native is not None and BoundStart.fits(self.description, names)
@@ -118,12 +136,6 @@ class FmuInstance(LoadedFmu):
                 return
             self.reset()
         self.initialize(None, values=values)
-
-    def _settle_start(self) -> None:
-        if self._step is None:
-            super()._settle_start()
-        else:
-            self._step.begin(self._began)
 
     def begin_texts(self, t: float) -> None:
         """Let the record of texts continue from a time in s."""

@@ -299,12 +299,6 @@ class LoadedFmu:
             others = {*self.description.texts, *(v.name for v in self.setup.input_variables.values())}  # set again
             names = [n for n in self._given if n not in others and self.description.find(n).causality != "input"]
             self._refuse_lost(self._find_lost({n: self._given[n] for n in names}), " after its initialization")
-        if self.fmi.event_mode_used:
-            self._settle_start()
-
-    def _settle_start(self) -> None:
-        """Settle the events at the start, where the FMU is in Event Mode now."""
-        self.call("the events at the start", self.fmi.settle_events)
 
     # ---- calls that are not made at each step ----
 

@@ -19,7 +19,7 @@ class SavedStates:
     handles : dict
         The FMU's handles of those that are not freed yet.
     final : ctypes value
-        Argument noSetFMUStatePriorToCurrentPoint of a step: true until a state has been saved.
+        Argument noSetFMUStatePriorToCurrentPoint of a step: true as long as no state has been saved.
     """
 
     def __init__(self, fmu: LoadedFmu):

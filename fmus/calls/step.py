@@ -440,6 +440,8 @@ class InstanceStep:
 
     def forget(self) -> None:
         """Forget the steps that were taken, before another run."""
+        if StepParts.ROLLBACK in self.parts:
+            self.states.final.value = False
         self._added[:] = math.nan
         if self._slopes is not None:
             self._slopes.last[:] = math.nan

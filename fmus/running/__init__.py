@@ -3,7 +3,7 @@
 from .derivation import Derivation, DerivativeMethod
 from .exchange_slopes import check_exchange_slopes, find_exchange_slopes
 from .fmu import Fmu, setup_of
-from .fmu_point import FmuLinearization
+from .fmu_point import FmuLinearization, open_to_step, take_step
 from .known_models import linearize_fmu, step_gap
 from .replacement import suggest_names
 from .restored_point import RestoredPoint
@@ -18,8 +18,10 @@ __all__ = [
     "check_exchange_slopes",
     "find_exchange_slopes",
     "linearize_fmu",
+    "open_to_step",
     "setup_of",
     "step_gap",
     "suggest_names",
     "take_shifted_steps",
+    "take_step",
 ]

@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, explain_calls, near
-from ..calls import FmuSetup, LoadedFmu, is_kept
+from ...blocks.core import (
+    FmuError,
+    FmuRuntimeError,
+    Layout,
+    ParameterError,
+    UnknownNameError,
+    brief,
+    elements,
+    explain_calls,
+    near,
+)
+from ..calls import FmuInstance, FmuSetup, LoadedFmu, is_kept
 from .derivation import Derivation
 from .fmu_start_values import check_state, check_value
 
@@ -176,9 +186,9 @@ class FmuPoint:
 
 
 @contextmanager
-def initialize_at(point: FmuPoint, exchange: bool) -> Iterator[LoadedFmu]:
-    """Load the FMU and enter Initialization Mode at the operating point."""
-    instance = LoadedFmu(point.setup, model_exchange=exchange)
+def initialize_in_exchange(point: FmuPoint) -> Iterator[LoadedFmu]:
+    """Load the FMU for model exchange, and enter Initialization Mode at the operating point."""
+    instance = LoadedFmu(point.setup, model_exchange=True)
     try:
         instance.initialize(None, start_time=point.t, values=_exact(point, {}))
         yield instance
@@ -186,7 +196,39 @@ def initialize_at(point: FmuPoint, exchange: bool) -> Iterator[LoadedFmu]:
         instance.close()
 
 
-def step_from(point: FmuPoint, instance: LoadedFmu, h: float, moved: Mapping[str, Any], lost: str) -> np.ndarray:
+@contextmanager
+def initialize_to_step(point: FmuPoint) -> Iterator[FmuInstance]:
+    """Load the FMU for co-simulation, and enter Initialization Mode at the operating point."""
+    instance = open_to_step(point.setup)
+    try:
+        instance.initialize(None, start_time=point.t, values=_exact(point, {}))
+        yield instance
+    finally:
+        instance.close()
+
+
+def open_to_step(setup: FmuSetup) -> FmuInstance:
+    """Load an FMU for steps to which no wire leads; its variables are set and read by their names."""
+    instance = FmuInstance(replace(setup, output_variables={}, text_variables={}), [])
+    try:
+        instance.bind(np.zeros(0), np.zeros(0))
+    except BaseException:
+        instance.close()
+        raise
+    return instance
+
+
+def take_step(instance: FmuInstance, t: float, h: float, refusal: str) -> None:
+    """Take a step from t over h, both in s; where the FMU asks to end the simulation in it, that is refused."""
+    try:
+        instance.step(t, h)
+    except FmuRuntimeError as error:
+        if not instance.ends_run:
+            raise
+        raise FmuError(refusal, block=instance.setup.label) from error
+
+
+def step_from(point: FmuPoint, instance: FmuInstance, h: float, moved: Mapping[str, Any], lost: str) -> np.ndarray:
     """Take a step of h seconds from a point's start with some values moved; return states and inputs before it.
 
     Exact start values are set by the initialization, inputs in Step Mode. ``lost`` says in an error what there is not
@@ -197,8 +239,7 @@ def step_from(point: FmuPoint, instance: LoadedFmu, h: float, moved: Mapping[str
     instance.begin()
     instance.call("setting its inputs", instance.set_values, {n: moved[n] for n in point.inputs if n in moved})
     before = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
-    if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, True):
-        raise FmuError(f"it ends its step early, so {lost}.", block=point.setup.label)
+    take_step(instance, point.t, h, f"it ends its step early, so {lost}.")
     return before
 
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from ...blocks.core import FmuError, ParameterError, accepts, kinds
 from ...blocks.tracing import extrapolate
-from ..calls import FmuSetup, LoadedFmu
+from ..calls import FmuInstance, FmuSetup, LoadedFmu
 from .derivation import Derivation, DerivativeMethod
 from .difference_quotients import Column, Differences, differentiate
-from .fmu_point import FmuLinearization, FmuPoint, initialize_at, step_from
+from .fmu_point import FmuLinearization, FmuPoint, initialize_in_exchange, initialize_to_step, step_from, take_step
 from .restored_point import RestoredPoint
 from .slope_check import SlopeCheck, check_slopes
 
@@ -57,7 +57,7 @@ def linear_model(
     )
     for exchange, derived, possible in ways:
         if possible and exact in (None, derived) and interface in (None, _interface_name(exchange)):
-            with initialize_at(point, exchange) as instance:
+            with initialize_in_exchange(point) if exchange else initialize_to_step(point) as instance:
                 return (
                     _linearize_by_directions(point, instance) if derived else _linearize_by_differences(point, instance)
                 )
@@ -280,11 +280,11 @@ def step_difference(
                 block=setup.label,
                 port=name,
             )
-    with initialize_at(point, exchange=False) as instance:
+    with initialize_to_step(point) as instance:
         return _linearize_step(point, instance, h, relative_step)
 
 
-def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_step: float) -> FmuLinearization:
+def _linearize_step(point: FmuPoint, instance: FmuInstance, h: float, relative_step: float) -> FmuLinearization:
     about, known = point.about, [*point.states, *point.inputs]
     instance.begin()
     x, u = instance.values(point.states), instance.values(point.inputs)
@@ -309,12 +309,11 @@ def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_ste
         elif not first:
             back.go_back()
         instance.set_values(set_after)
-        if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, not back.is_restored):
-            raise FmuError(
-                f"it ends its step from t = {point.t:.9g} s by {h:g} s early, or asks to end the simulation in it "
-                "(terminateSimulation), so the step has no derivative. Take a smaller h, or another operating point.",
-                block=point.setup.label,
-            )
+        refusal = (
+            f"it ends its step from t = {point.t:.9g} s by {h:g} s early, or asks to end the simulation in it "
+            "(terminateSimulation), so the step has no derivative. Take a smaller h, or another operating point."
+        )
+        take_step(instance, point.t, h, refusal)
         return instance.values([*point.states, *point.outputs])
 
     try:
@@ -349,7 +348,7 @@ def find_step_gap(
     """
     point = FmuPoint(setup, t, state, inputs)
     about = point.about
-    with initialize_at(point, exchange=False) as instance:
+    with initialize_to_step(point) as instance:
         found, names = {}, [*point.states, *point.inputs]
 
         def step(moved: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:

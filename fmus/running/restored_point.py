@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from ..calls import LoadedFmu
+from ..calls import FmuInstance, FmuState
 
 _ROUNDING = 1e-12
 """Largest difference of a value that was restored, relative to its size: far below the distances of differences."""
@@ -21,10 +20,10 @@ class RestoredPoint:
     FMU says that it has restored one and has not (`lied`), ``start`` brings a fresh instance to the point.
     """
 
-    def __init__(self, instance: LoadedFmu, names: Sequence[str], start: Callable[[], None]):
+    def __init__(self, instance: FmuInstance, names: Sequence[str], start: Callable[[], None]):
         self._instance, self._names, self._start = instance, [*names], start
         self.is_restored, self.lied = instance.description.can_save, False
-        self._handle: Any = None
+        self._state: FmuState | None = None
         about = [instance.description.find(name) for name in names]
         self._nominals = np.concatenate([np.zeros(0), *(np.abs(np.ravel(v.nominals)) for v in about)])
         self._open = np.ones(self._nominals.size, dtype=bool)
@@ -35,13 +34,13 @@ class RestoredPoint:
         instance = self._instance
         self.free()
         if self.is_restored:
-            self._handle = instance.call("saving its state", instance.fmi.save_state)
-            instance.call("restoring its state", instance.fmi.set_state, self._handle)
+            self._state = instance.save()
+            instance.restore(self._state)
             self._begun = instance.values(self._names)
 
     def go_back(self) -> None:
         """Bring the instance to the point."""
-        if self._handle is not None and self._restore():
+        if self._state is not None and self._restore(self._state):
             return
         self.free()
         self._start()
@@ -58,15 +57,15 @@ class RestoredPoint:
 
     def free(self) -> None:
         """Free the saved state; do so before the instance is made again, to which it does not belong."""
-        if self._handle is not None:
-            self._instance.free_state(self._handle)
-            self._handle = None
+        if self._state is not None:
+            self._state.free()
+            self._state = None
 
-    def _restore(self) -> bool:
+    def _restore(self, state: FmuState) -> bool:
         """Restore the state; return whether the values are those of the point."""
         instance, compares = self._instance, bool(self._open.any())
         moved = instance.values(self._names) if compares else self._begun
-        instance.call("restoring its state", instance.fmi.set_state, self._handle)
+        instance.restore(state)
         if not compares:
             return True
         allowed, found = _ROUNDING * (self._nominals + np.abs(self._begun)), instance.values(self._names)

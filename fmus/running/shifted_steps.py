@@ -9,7 +9,7 @@ import numpy as np
 
 from ...blocks.core import FmuError
 from .fmu import Fmu, setup_of
-from .fmu_point import FmuPoint, initialize_at, step_from
+from .fmu_point import FmuPoint, initialize_to_step, step_from
 
 
 def take_shifted_steps(
@@ -32,7 +32,7 @@ def take_shifted_steps(
                 block=block.label,
                 port=name,
             )
-    with initialize_at(point, exchange=False) as instance:
+    with initialize_to_step(point) as instance:
         at = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
 
         def step(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
