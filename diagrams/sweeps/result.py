@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 class Sweep(ShownAsTable):
     """The results of a sweep.
 
-    ``sweep["name"]`` is an array with one row for each sample, in their order: a reduction, or the samples of a signal
-    over time. A run that failed has NaN in place of its reductions, and of the samples after its end. ``dataset`` has
-    it all with names, units and parameters.
+    ``sweep["name"]`` is an array with one row for each sample, in their order: a reduction, the samples of a signal
+    over time, or the values of a parameter, by its path. A run that failed has NaN in place of its reductions, and of
+    the samples after its end. ``dataset`` has it all with names and units.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class Sweep(ShownAsTable):
 
     @accepts("sweep[…]", name=kinds.text)
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return a reduction, shape (N, *shape), or the samples of a signal, (N, n, *shape).
+        """Return a reduction or a parameter's values, shape (N, *shape), or the samples of a signal, (N, n, *shape).
 
         Raises
         ------
@@ -139,7 +139,10 @@ class Sweep(ShownAsTable):
             return self._stack(name, [None if o is None else o.numbers.get(name) for o in self.outcomes])
         if name in self._signals:
             return self._stack_samples(name)
-        raise UnknownNameError(f"the sweep holds no {name!r}. {near(name, self.names)}", block=self.diagram_name)
+        if name in self.samples.names:
+            return self.samples.column(name)
+        known = [*self.names, *self.samples.names]
+        raise UnknownNameError(f"the sweep holds no {name!r}. {near(name, known)}", block=self.diagram_name)
 
     def plot(self, *names: str, xlim: tuple[float, float] | None = None) -> Figure:
         """Draw signals of all runs over each other, one axis for each number, and return the figure.

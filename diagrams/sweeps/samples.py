@@ -167,6 +167,19 @@ class Samples(Sequence[Sample]):
         """Number of samples along each axis of a grid; one number where it is no grid."""
         return (len(self),) if self.axes is None else tuple(len(values) for values in self.axes.values())
 
+    def column(self, name: str) -> np.ndarray:
+        """Return the values of a parameter, one row for each sample; blocks, and arrays of several shapes, as objects.
+
+        Raises `ValueError` for a name that is not among the names.
+        """
+        values = [row[self.names.index(name)] for row in self.rows]
+        plain = all(isinstance(value, bool | int | float | str | tuple | list | np.ndarray) for value in values)
+        if plain and len({np.shape(value) for value in values}) == 1:
+            return np.array(values)
+        found = np.empty(len(values), dtype=object)
+        found[:] = values
+        return found
+
     def resolve(self, diagram: WiredDiagram) -> Samples:
         """Return the samples with the full path of each parameter in a diagram.
 

@@ -211,6 +211,20 @@ def test_zeros_blocks_sample_times_and_fixed_values_may_be_swept_too():
     assert len({found["h"][i].tobytes() for i in range(8)}) == 8
 
 
+def test_parameters_are_read_as_results_are_one_row_for_each_sample():
+    diagram = many_rates()
+    first, second = Step(times=0.0, values=2.0), Constant(value=-1.0)
+    parameters = {"start.factor": (0.0, 2.0), "source": (first, second)}
+    found = diagram.sweep(parameters, 0.01, reduce={"end": final("h")}, **INTERPRETED)
+    np.testing.assert_array_equal(found["fast.start.factor"], [0.0, 0.0, 2.0, 2.0])
+    assert [*found["source"]] == [first, second, first, second]
+    with pytest.raises(UnknownNameError, match=r"holds no 'start\.factor'\. .*'fast\.start\.factor'"):
+        found["start.factor"]
+    table = [{"source.values": (1.0, -0.5)}, {"source.values": (2.0, 0.5)}]
+    found = diagram.sweep(None, 0.01, samples=table, reduce={"end": final("h")}, **INTERPRETED)
+    np.testing.assert_array_equal(found["source.values"], [[1.0, -0.5], [2.0, 0.5]])
+
+
 def test_a_block_that_is_replaced_and_its_parameters_go_together():
     diagram = many_rates()
     table = [
