@@ -243,6 +243,7 @@ UNITS = {
     **dict.fromkeys(("henry",), "H"),
     **dict.fromkeys(("farad",), "F"),
     **dict.fromkeys(("tesla",), "T"),
+    **dict.fromkeys(("kmh", "kph"), "km/h"),
 }
 """Symbols of units that are written out, in lower case."""
 

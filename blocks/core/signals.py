@@ -240,8 +240,8 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
             return constant
     made = as_block(value, "(…)")
     raise WiringError(
-        f"found {shorten(value)}; expected a signal, a call, a block with one output, numbers, or a list of these."
-        + f" {made}." * bool(made),
+        f"found {shorten(value)}; expected a signal, a call, a block with one output, finite numbers, or a list of "
+        "these." + f" {made}." * bool(made),
         block=block,
         port=port,
     )

@@ -145,7 +145,7 @@ def cell_text(value: Any, longest: int = LONGEST) -> str:
         value = value.tolist() if value.size <= LONGEST else f"array of shape {value.shape}"
     if isinstance(value, list | tuple):
         value = ", ".join(cell_text(one) for one in value[:LONGEST])
-    text = printable(str(value))
+    text = printable(repr(value) if isinstance(value, ShownAsTable) else str(value))
     return text if len(text) <= longest else text[: longest - 1] + "…"
 
 

@@ -9,6 +9,7 @@ without the dot: ``Nm``, ``Wh``, ``Ah``, ``VA``.
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 from dataclasses import dataclass, replace
@@ -133,7 +134,8 @@ def _symbol(symbol: str, text: str) -> Unit:
     if prefix in _PREFIXES and rest in _PREFIXED:
         base = _PREFIXED[rest]
         return Unit("", base.exponents, base.factor * _PREFIXES[prefix])
-    known = UNITS.get(symbol.casefold())
+    words = difflib.get_close_matches(symbol.casefold(), UNITS, n=1, cutoff=0.8)
+    known = UNITS[words[0]] if words else None
     hint = near(symbol, {**_PLAIN, **_PREFIXED}) if known is None else f"Did you mean {known!r}?"
     raise UnitError(f"the unit {text!r} has an unknown symbol {symbol!r}. {hint} {_NEXT}")
 

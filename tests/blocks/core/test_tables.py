@@ -99,6 +99,7 @@ def test_a_block_shows_its_parameters_and_ports():
     assert re.search(r"^r +set-point$", text, re.MULTILINE)
     assert "proportional gain" in Cells(PID(kp=1.5, ki=2.0)._repr_html_()).text
     assert repr(Gain(gain=2.0, name="g")) == "Gain(gain=2, name='g')"
+    assert cell_text(Gain(gain=2.0, name="g")) == "Gain(gain=2, name='g')"  # of a parameter that is a block itself
 
 
 @pytest.mark.parametrize("kind", [PID, Gain])

@@ -94,6 +94,8 @@ def test_temperature_has_an_offset():
     ("text", "part"),
     [
         ("Nmm", "unknown symbol 'Nmm'. Did you mean 'Nm'"),
+        ("Voltt", "unknown symbol 'Voltt'. Did you mean 'V'?"),
+        ("kmh", "unknown symbol 'kmh'. Did you mean 'km/h'?"),
         ("m/", "can't be read at ''"),
         ("N/(m/s", "ambiguous after '/'"),
         ("foo", "Write it as FMI does: 'm/s2'"),

@@ -119,9 +119,11 @@ def test_too_many_signals():
 def test_something_that_is_no_signal():
     with pytest.raises(
         WiringError,
-        match=r"gain\.u: found 'speed'; expected a signal, a call, a block with one output, numbers, or a list",
+        match=r"gain\.u: found 'speed'; expected a signal, a call, a block with one output, finite numbers, or a list",
     ):
         Gain(gain=1)("speed")
+    with pytest.raises(WiringError, match=r"gain\.u: found nan; expected .* finite numbers"):
+        Gain(gain=1)(float("nan"))
 
 
 def test_a_call_with_two_outputs_is_not_one_signal():
