@@ -427,7 +427,7 @@ class _Variables:
                 shape = own.shapes[name]
                 computed = block.starts_from_inputs and path not in self._untraced
                 start = None if computed else np.array(self._x[where]).reshape(shape)
-                label, about = join(self._opened.shown(path), name), (_unit(port.unit), port.description)
+                label, about = self._state_label(path, name), (_unit(port.unit), port.description)
                 kind: Literal["continuous", "discrete"] = "continuous" if computed else "discrete"
                 variable = Variable(label, "local", kind, shape, *about, start=start, state=not computed)
                 places = tuple(range(where.start, where.stop))
@@ -442,7 +442,14 @@ class _Variables:
     def found_at_build(self) -> tuple[str, ...]:
         """Return the names of the states whose start is not computed by the exported code."""
         own = self._flat.states.of_block
-        return tuple(join(self._opened.shown(path), name) for path in self._untraced for name in own[path].slices)
+        return tuple(self._state_label(path, name) for path in self._untraced for name in own[path].slices)
+
+    def _state_label(self, path: str, name: str) -> str:
+        """Return the name of a state; of one that is an output, too, with a word more, as each is a variable."""
+        label = join(self._opened.shown(path), name)
+        while label in self._opened.outputs:
+            label += "_state"
+        return label
 
     def depends(self, acting: Sequence[frozenset[TickPattern]]) -> dict[str, tuple[int, ...]]:
         """Return the entries of w on which outputs and signals depend at an instant, at any kind of tick."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopwright import Fmu, build
-from loopwright.blocks import PID, OptionError, Step, TransferFunction
+from loopwright.blocks import PID, PT1, OptionError, Step, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
 from support.instances import open_instance
 
@@ -75,3 +75,11 @@ def test_what_another_kind_of_model_has_is_refused(diagram):
         build(TransferFunction(**PLANT), subsystem="controller")
     with pytest.raises(OptionError, match="expected 'any' or 'ticks'"):
         build(diagram, communication="never")
+
+
+def test_a_state_that_nothing_reads_and_its_output_have_two_names(uncompiled, tmp_path):
+    """Of one name, no importer took them: `PT1` puts out its state, by the path of both."""
+    file = build(Diagram("plain", PT1(time_constant=1.0, name="lag")(1.0)), tmp_path / "plain.fmu")
+    names = [v.name for v in fmpy.read_model_description(str(file), validate=False).modelVariables]
+    assert len(names) == len({*names})
+    assert {"lag.y", "lag.y_state"} <= {*names}

@@ -11,6 +11,7 @@ from fmpy.validation import validate_fmu
 from loopwright import build, experiments
 from loopwright.blocks import (
     PID,
+    PT1,
     Constant,
     DiscreteStateSpace,
     Gain,
@@ -265,6 +266,20 @@ def test_a_diagram_without_names_puts_out_what_nothing_reads(tmp_path):
     assert item["thrice.y"] == 0.0
     item.step(0.0, 1.0)
     assert item["thrice.y"] == pytest.approx(3.0 * (1.0 - np.exp(-0.5)), rel=1e-7)
+    item.free()
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_a_state_that_is_an_output_is_two_variables(fmi, tmp_path):
+    """Two variables of one name make no FMU: the state has a word more, and starts the run, y = 1 − (1 − y₀) e⁻ᵗ."""
+    lag = PT1(time_constant=1.0, name="lag")
+    file = build(Diagram("plain", lag(Constant(value=1.0, name="one"))), tmp_path / "lag.fmu", fmi=fmi, tolerance=1e-9)
+    assert validate_fmu(str(file)) == []
+    assert not validate(file).problems
+    item = open_instance(file, tmp_path / "item").initialize(**{"lag.y_state": 0.25})
+    assert item["lag.y"] == 0.25
+    item.step(0.0, 1.0)
+    assert item["lag.y"] == item["lag.y_state"] == pytest.approx(1.0 - 0.75 * np.exp(-1.0), rel=1e-7)
     item.free()
 
 
