@@ -18,7 +18,7 @@ from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import Linearization, find_signal, linearize, wire_entries
 from ..results import OperatingPoint
 from ..wiring import join
-from .step_response import predict
+from .predicted_step import predict
 
 if TYPE_CHECKING:
     from ..frequency import LoopTransfer
