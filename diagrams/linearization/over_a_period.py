@@ -424,10 +424,8 @@ class TickModel(NamedTuple):
     """
 
     matrices: FourMatrices
-    duration: float  # time to the next tick in s  # time to the next tick in s
-    # whether the plant exchanges signals at the tick: always, if it is no FMU
+    duration: float  # time to the next tick in s
     steps: bool  # whether the plant exchanges signals at the tick: always, if it is no FMU
-    # whether each injected wire is renewed at the tick; wires of continuous blocks and FMUs always are
     # whether each injected wire is renewed at the tick; wires of continuous blocks and FMUs always are
     renews: tuple[bool, ...]
 

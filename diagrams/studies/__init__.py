@@ -1,7 +1,8 @@
 """Studies of a design's margins over its parameters: sensitivities, worst cases."""
 
 from .cases import CaseOrigin, CaseState, StudyCase
-from .confirmed_cases import ConfirmationKind, RunConfirmation, confirm_parameter, confirm_sensitivity
+from .confirmed_cases import ConfirmationKind, RunConfirmation
+from .confirmed_sensitivity import confirm_parameter, confirm_sensitivity
 from .contact_task import ContactTask
 from .loop_places import LoopPlace, cut_places, find_places, is_zero, words_of
 from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of

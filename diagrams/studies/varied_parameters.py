@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, OptionError, ParameterSpec, Value, shorten
+from ...blocks.core import Block, OptionError, ParameterSpec, Value
 from ...blocks.tracing import traced_parameters
 from ..flat import WiredDiagram
-from ..sweeps import Box
 from ..wiring import index_of, split_entry, split_path
 
 
@@ -105,11 +104,11 @@ def unit_of(diagram: WiredDiagram, parameter: str) -> str:
         about: Any = block
         variable = about.description.variables.get(start)
         return str(getattr(variable, "unit", None) or "")
-    spec = _find_declaration(block, keys)
+    spec = find_declaration(block, keys)
     return "" if spec is None or spec.unit is None else spec.unit
 
 
-def _find_declaration(block: Block, keys: list[str]) -> ParameterSpec | None:
+def find_declaration(block: Block, keys: list[str]) -> ParameterSpec | None:
     """Return the declaration of a parameter at a path of attribute names; None where there is none."""
     owner: Any = block
     for key in keys[:-1]:
@@ -118,34 +117,6 @@ def _find_declaration(block: Block, keys: list[str]) -> ParameterSpec | None:
             return None
     specs: Mapping[str, ParameterSpec] = type(owner).parameter_specs
     return specs.get(keys[-1])
-
-
-def check_ranges(diagram: WiredDiagram, boxes: Mapping[str, Box]) -> None:
-    """Refuse ranges with an end outside of the bounds that the parameter itself declares, before a case is computed.
-
-    What a block refuses in view of its other parameters is left to the cases: others may go with it.
-    """
-    for name, box in boxes.items():
-        if name in diagram.structure.blocks:
-            continue
-        path, keys = split_path(diagram.structure, name.partition("[")[0], diagram.name)
-        spec = _find_declaration(diagram.structure.blocks[path], keys)
-        if spec is None:
-            continue
-        for words, bound, holds in (
-            ("above", spec.above, np.greater),
-            ("at least", spec.minimum, np.greater_equal),
-            ("at most", spec.maximum, np.less_equal),
-        ):
-            ends = (np.asarray(end, dtype=float) for end in (box.low, box.high))
-            if bound is not None and not all(np.all(holds(end, bound)) for end in ends):
-                unit = f" {spec.unit}" if spec.unit and spec.unit != "1" else ""
-                raise OptionError(
-                    f"found a range from {shorten(box.low)} to {shorten(box.high)}; expected values {words} "
-                    f"{bound:g}{unit}, as the parameter takes them. Give a range within.",
-                    block=path,
-                    port=name.removeprefix(f"{path}."),
-                )
 
 
 def changed_entry(diagram: WiredDiagram, parameter: str, value: float) -> dict[str, Any]:

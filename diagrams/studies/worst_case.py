@@ -26,13 +26,14 @@ from ..flat import WiredDiagram
 from ..frequency import Number, order_key
 from ..linearization import carry_point
 from ..requirements import REQUIREMENTS, Requirements
-from ..sweeps import Box, Samples, read_samples
+from ..sweeps import Box, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmed_cases import RunConfirmation, confirm_case
 from .loop_places import OtherCuts, place_loops
 from .measures import ContactMeasure, FunctionMeasure, Measure
 from .numbers import write_open_loop
-from .varied_parameters import check_parameters, check_ranges
+from .ranges import check_ranges, read_boxes
+from .varied_parameters import check_parameters
 from .worst_case_plot import plot_cases
 from .worst_case_search import Study
 
@@ -280,7 +281,7 @@ def find_worst_case(
         count = 100
     drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
     check_parameters(diagram, drawn.names, "a worst case", blocks=True)
-    boxes = _read_boxes(drawn)
+    boxes = read_boxes(drawn)
     check_ranges(diagram, boxes)
     places = tuple(points) if points is not None else (at,)
     study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None), measure)
@@ -340,16 +341,3 @@ def _make_measure(
         return ContactMeasure(contact, diagram, options)
     assert callable(quantity)
     return FunctionMeasure(quantity, diagram.name)
-
-
-def _read_boxes(drawn: Samples) -> dict[str, Box]:
-    """Return the ranges of a search: those of a Latin hypercube, or from the least to the largest value of a grid."""
-    if drawn.boxes:
-        return dict(drawn.boxes)
-    if drawn.axes is None:
-        return {}
-    return {
-        name: Box(min(values), max(values))
-        for name, values in drawn.axes.items()
-        if all(isinstance(v, float | int) and not isinstance(v, bool) for v in values)
-    }

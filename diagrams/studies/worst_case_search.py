@@ -27,6 +27,7 @@ from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe
 from .loop_places import OtherCuts, numbers_at_other_cuts
 from .measures import Measure
 from .numbers import numbers_of
+from .ranges import Ranges
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -64,7 +65,7 @@ class Study:
         self.diagram, self.goal, self.boxes, self.points = diagram, goal, boxes, points
         self.delay, self.options, self.notify, self.measure = delay, options, notify, measure
         self.cases: list[StudyCase] = []
-        self.names = [(name, i) for name, box in boxes.items() for i in range(box.size)]
+        self.ranges = Ranges(boxes)
         self.smooth = {name for name in boxes if not _is_start_value(diagram, name)}
         self._bases: dict[int, Linearization] = {}
         self._loops: dict[int, dict[tuple[str, ...], StateSpace]] = {}
@@ -77,7 +78,7 @@ class Study:
 
     def run(self, parameters: Mapping[str, Any], origin: CaseOrigin) -> list[StudyCase]:
         """Return the cases of some parameters at all points; a search doesn't compute those that are known again."""
-        where = self.fractions_of(parameters) if parameters and parameters.keys() == self.boxes.keys() else None
+        where = self.ranges.fractions_of(parameters) if parameters and parameters.keys() == self.boxes.keys() else None
         if where is not None and origin in (CaseOrigin.CORNER, CaseOrigin.SEARCH):
             for known, cases in self._places:
                 if np.max(np.abs(known - where)) <= SAME_POINT:
@@ -206,44 +207,14 @@ class Study:
         state = CaseState.STABLE if rests or not base.is_equilibrium else CaseState.MOVING
         return replace(case, state=state, goodness=worst[0], loop=worst[1], quantity=worst[2], numbers=numbers)
 
-    # --- ranges -------------------------------------------------------------------------------------------------------
-
-    def parameters_at(self, fractions: np.ndarray) -> dict[str, Any]:
-        """Return the parameters at a point of the ranges, each fraction between 0 and 1."""
-        found, first = {}, 0
-        for name, box in self.boxes.items():
-            part = np.clip(fractions[first : first + box.size], 0.0, 1.0)
-            found[name] = box.at(part if np.ndim(box.low) else float(part[0]))
-            first += box.size
-        return found
-
-    def fractions_of(self, parameters: Mapping[str, Any]) -> np.ndarray:
-        """Return the point of the ranges at which parameters are."""
-        parts = []
-        for name, box in self.boxes.items():
-            low, high, value = (np.ravel(np.asarray(v, dtype=float)) for v in (box.low, box.high, parameters[name]))
-            if box.scale == "log":
-                low, high, value = np.log(low), np.log(high), np.log(value)
-            width = np.where(high > low, high - low, 1.0)
-            parts.append(np.clip((value - low) / width, 0.0, 1.0))
-        return np.concatenate(parts)
-
-    def _widths(self, parameters: Mapping[str, Any]) -> np.ndarray:
-        """Return the derivative of each parameter's numbers by its fraction."""
-        parts = []
-        for name, box in self.boxes.items():
-            low, high, value = (np.ravel(np.asarray(v, dtype=float)) for v in (box.low, box.high, parameters[name]))
-            parts.append(value * np.log(high / low) if box.scale == "log" else high - low)
-        return np.concatenate(parts)
-
     # --- search -------------------------------------------------------------------------------------------------------
 
     def try_corners(self) -> None:
         """Run the corners of the ranges: all of a few parameters."""
-        n = len(self.names)
+        n = len(self.ranges.names)
         if n <= MOST_CORNERS:
             for corner in itertools.product((0.0, 1.0), repeat=n):
-                self.run(self.parameters_at(np.array(corner)), CaseOrigin.CORNER)
+                self.run(self.ranges.parameters_at(np.array(corner)), CaseOrigin.CORNER)
 
     def search(self, starts: int, steps: int) -> None:
         """Go downhill from the worst cases that could be analysed; an unstable one is bad enough."""
@@ -253,7 +224,7 @@ class Study:
         for case in ranked:
             if len(begun) == starts or self._is_lost():
                 break
-            fractions = self.fractions_of(case.parameters)
+            fractions = self.ranges.fractions_of(case.parameters)
             if any(np.max(np.abs(fractions - other)) < 0.05 for other in begun):
                 continue
             begun.append(fractions)
@@ -262,7 +233,7 @@ class Study:
             self._polish()
 
     def _worst_at(self, fractions: np.ndarray) -> StudyCase:
-        return min(self.run(self.parameters_at(fractions), CaseOrigin.SEARCH), key=lambda c: c.goodness)
+        return min(self.run(self.ranges.parameters_at(fractions), CaseOrigin.SEARCH), key=lambda c: c.goodness)
 
     def _is_lost(self) -> bool:
         return any(case.state is CaseState.UNSTABLE for case in self.cases)
@@ -292,9 +263,9 @@ class Study:
             )
         except _LostError:
             return
-        if ends and len(self.names) > MOST_CORNERS:
+        if ends and len(self.ranges.names) > MOST_CORNERS:
             corner = np.where(ends[-1] > 0.0, 0.0, 1.0)
-            self.run(self.parameters_at(np.where(ends[-1] == 0.0, fractions, corner)), CaseOrigin.CORNER)
+            self.run(self.ranges.parameters_at(np.where(ends[-1] == 0.0, fractions, corner)), CaseOrigin.CORNER)
 
     def gradient(self, case: StudyCase, fractions: np.ndarray) -> np.ndarray:
         """Return the derivative of a case's goodness by the fractions, exact where the parameters are traced.
@@ -318,7 +289,7 @@ class Study:
         by_matrices = margin_slopes(rational_loop(L), [s.slopes for s in known], delay=self.delay)
         exact = iter(by_matrices[case.quantity].slopes)
         by_number = self.goal.slope(case.loop, case.quantity, case.value)
-        widths = self._widths(case.parameters)
+        widths = self.ranges.widths_at(case.parameters)
         for i, slope in enumerate(slopes):
             value = math.nan if slope is None else next(exact)
             if math.isfinite(value):
@@ -345,7 +316,7 @@ class Study:
         for step in PATTERN:
             better = True
             while better and not self._is_lost():
-                better, middle = False, self.fractions_of(best.parameters)
+                better, middle = False, self.ranges.fractions_of(best.parameters)
                 for i, side in itertools.product(range(middle.size), (1.0, -1.0)):
                     moved = middle.copy()
                     moved[i] = np.clip(moved[i] + side * step, 0.0, 1.0)

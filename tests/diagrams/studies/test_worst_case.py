@@ -148,11 +148,11 @@ def test_the_gradient_of_the_search_is_that_of_the_margin():
     study = Study(diagram.wired, goal, boxes, (None,), 0, {}, lambda text: None)
     study.run({}, CaseOrigin.NOMINAL)
     at = np.array([0.4, 0.6])
-    case = study.run(study.parameters_at(at), CaseOrigin.SEARCH)[0]
+    case = study.run(study.ranges.parameters_at(at), CaseOrigin.SEARCH)[0]
     found = study.gradient(case, at)
 
     def margin(x):
-        values = study.parameters_at(x)
+        values = study.ranges.parameters_at(x)
         return pi_phase_margin(values["p.gain"], values["ki.gain"], 2.0)
 
     h = 1e-4
