@@ -268,7 +268,7 @@ class RateLimiter(StartsAtInput, Block):
         if self.time_constant is None:
             raise SampleTimeError(
                 "found none; expected a lag in a continuous subsystem. Give RateLimiter(time_constant=…) in s, short "
-                "beside the times that matter, or put the block into a @subsystem(sample_time=…), where it is exact.",
+                "next to the times that matter, or put the block into a @subsystem(sample_time=…), where it is exact.",
                 port="time_constant",
             )
         return self.clip_change((u.u - x.last) / self.time_constant, 1.0)

@@ -195,7 +195,11 @@ class WiredDiagram:
             )
         for path, settings in table.subsystems.items():
             table.subsystems[path] = replace_fields(settings, sample_time=None, offset=Fraction(0), delay=0)
-        return self.with_structure(table)
+        try:
+            return self.with_structure(table)
+        except SampleTimeError as error:
+            error.message = f"continuous() takes the sample times away: {error.message}"
+            raise
 
     def sampled(self, sample_time: float | Fraction, method: str = "exact") -> WiredDiagram:
         """Return the diagram with all its continuous blocks sampled; see `Diagram.sampled`."""

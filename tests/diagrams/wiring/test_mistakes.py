@@ -16,6 +16,7 @@ from loopwright.blocks import (
     Integrator,
     Output,
     ParameterError,
+    RateLimiter,
     SampleTimeError,
     Saturation,
     ShapeError,
@@ -392,6 +393,18 @@ def test_a_block_at_samples_alone_has_no_continuous_ideal_and_can_be_replaced():
     ideal = diagram.replace({"delayed.delay": Ideal(), "delayed.first": Ideal()}).continuous()
     assert not ideal.wired.has_clock
     np.testing.assert_array_equal(ideal.simulate(1.0, step=0.1, progress=False)["y"], 6.0)
+
+
+def test_a_block_that_needs_more_in_continuous_time_says_that_its_sample_time_was_taken():
+    @subsystem(sample_time=0.1)
+    def limited(u):
+        return RateLimiter(rising=1.0, name="rate")(u)
+
+    diagram = Diagram("d", limited(Constant(value=2.0)))
+    words = r"^limited\.rate\.time_constant: continuous\(\) takes the sample times away: found none; expected a lag"
+    with pytest.raises(SampleTimeError, match=words):
+        diagram.continuous()
+    assert not diagram.replace({"rate.time_constant": 0.01}).continuous().wired.has_clock
 
 
 @pytest.mark.parametrize(
