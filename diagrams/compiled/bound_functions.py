@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
 
@@ -29,14 +29,16 @@ class TickStructure(ctypes.Structure):
     _fields_ = [(name, ctypes.c_void_p) for name in ("evaluate", "arguments", "results", "iw", "w")]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BoundFunction:
     """A function bound to vectors: it as C knows it, and whatever must live as long as that."""
 
     structure: TickStructure
     arguments: Sequence[np.ndarray]
     results: Sequence[np.ndarray]
-    kept: list[Any]
+    inner: Any  # what ``structure.iw`` leads to: a struct, or integers
+    memory: np.ndarray  # what it works in; ``structure.w`` leads to it where C is given that
+    kept: list[Any]  # whatever else must live
     failures: list[Exception] = field(default_factory=list)
     """The last error of Python within a call that has failed."""
 
@@ -98,7 +100,7 @@ class CompiledFunction(FunctionInC):
         made = list_vectors(results, self.function.sz_res())
         first = at(iw) if isinstance(iw, np.ndarray) else ctypes.addressof(iw)
         structure = TickStructure(self.address, ctypes.addressof(given), ctypes.addressof(made), first, at(w))
-        return BoundFunction(structure, arguments, results, [given, made, iw, w])
+        return BoundFunction(structure, arguments, results, iw, w, [given, made])
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,20 +108,21 @@ class MachineFunction(CompiledFunction):
     """A CasADi function as a program of the virtual machine, whose C function is at the address."""
 
     program: MachineProgram
-    _bound: list[tuple[Any, BoundFunction]] = field(default_factory=list)
+    _bound: WeakSet[BoundFunction] = field(default_factory=WeakSet)
 
     def bind(
         self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
     ) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         program, values = self.program.bind()
-        self._bound.append((program, self._bind(arguments, results, program, values)))
-        return self._bound[-1][1]
+        bound = self._bind(arguments, results, program, values)
+        self._bound.add(bound)
+        return bound
 
     def hand_over(self, to: Any) -> None:
         """Let generated code of the same function take over."""
-        for program, bound in self._bound:
-            made = to.bind(bound.arguments, bound.results)
+        for bound in self._bound:
+            program, made = bound.inner, to.bind(bound.arguments, bound.results)
             program.iw, program.w = made.structure.iw, made.structure.w
             program.generated = made.structure.evaluate
             bound.kept.append(made)
@@ -162,7 +165,8 @@ class CalledFunction(CompiledFunction):
         structure = TickStructure(
             ctypes.cast(function, ctypes.c_void_p).value, *map(ctypes.addressof, lists), None, None
         )
-        return BoundFunction(structure, arguments, results, [taken, made, bound, function, lists], failures)
+        kept = [taken, made, bound, function, lists]
+        return BoundFunction(structure, arguments, results, None, np.zeros(0), kept, failures)
 
 
 def call_for_c(call: Callable[[], None]) -> None:

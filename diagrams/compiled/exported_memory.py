@@ -196,7 +196,7 @@ def _memories(kept: Iterable[Any]) -> Iterator[Any]:
             if len(item):
                 yield item
         elif isinstance(item, BoundFunction):
-            yield from _memories([*item.arguments, *item.results, *item.kept])
+            yield from _memories([*item.arguments, *item.results, item.inner, item.memory, *item.kept])
         elif isinstance(item, (list, tuple)):
             yield from _memories(item)
 

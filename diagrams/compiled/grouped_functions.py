@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 
@@ -69,7 +70,7 @@ class GroupedFunction(FunctionInC):
     tables: TickTables | PartTables
     kernels: Kernels
     address: int
-    _bound: list[tuple[Any, np.ndarray, BoundFunction]] = field(default_factory=list, kw_only=True)
+    _bound: WeakSet[BoundFunction] = field(default_factory=WeakSet, kw_only=True)
 
     @property
     def calls_python(self) -> bool:
@@ -85,16 +86,15 @@ class GroupedFunction(FunctionInC):
         structure.calls = _bind_calls(self.tables.calls, self.kernels, v, arguments[3], kept, failures)
         lists = list_vectors(arguments, 5), list_vectors(results, 4)
         evaluate = TickStructure(self.address, *map(ctypes.addressof, (*lists, structure)), at(v))
-        bound = BoundFunction(evaluate, arguments, results, [self, v, structure, lists, kept], failures)
-        self._bound.append((structure, v, bound))
+        bound = BoundFunction(evaluate, arguments, results, structure, v, [self, lists, kept], failures)
+        self._bound.add(bound)
         return bound
 
     def hand_over(self, to: Any) -> None:
         """Let other kernels of the same blocks take over wherever it is bound; C must not run meanwhile."""
-        for structure, v, bound in self._bound:
-            structure.calls = _bind_calls(
-                to.tables.calls, to.kernels, v, bound.arguments[3], bound.kept, bound.failures
-            )
+        for bound in self._bound:
+            p = bound.arguments[3]
+            bound.inner.calls = _bind_calls(to.tables.calls, to.kernels, bound.memory, p, bound.kept, bound.failures)
 
     @abstractmethod
     def _structure(self, arguments: Sequence[np.ndarray]) -> Any:

@@ -112,8 +112,8 @@ class SlopesByDifferences(FunctionInC):
         into = list_vectors(results, len(results))
         address = address_of(load_runtime(), "loopwright_equations" if self.values else "loopwright_slopes")
         evaluate = TickStructure(address, None, ctypes.addressof(into), ctypes.addressof(structure), None)
-        kept = [self, bound, structure, into, loops, dx, before, step, sizes, values]
-        return BoundFunction(evaluate, arguments, results, kept)
+        kept = [self, bound, into, loops, dx, before, step, sizes]
+        return BoundFunction(evaluate, arguments, results, structure, values, kept)
 
     def hand_over(self, to: Any) -> None:
         """Let generated code of the same function take over."""

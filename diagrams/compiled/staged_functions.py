@@ -50,7 +50,7 @@ class Staged(FunctionInC):
         found = _ScheduleInC(len(made), ctypes.addressof(made))
         address, last = address_of(load_runtime(), "loopwright_stages"), made[len(made) - 1].f.results
         structure = TickStructure(address, None, last, ctypes.addressof(found), None)
-        return BoundFunction(structure, arguments, results, [self, c, *kept, made, found])
+        return BoundFunction(structure, arguments, results, found, c, [self, *kept, made])
 
     def hand_over(self, to: Any) -> None:
         """Let generated code of the same stages take over."""

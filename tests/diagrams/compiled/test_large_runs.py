@@ -1,5 +1,8 @@
 """Large diagrams in C's loop without a compiler: programs of the virtual machine for each kind of block."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -21,8 +24,8 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled import background, grouped_functions
-from loopwright.diagrams.flat import flat_diagram
+from loopwright.diagrams.compiled import background, bind_call, compile_code, grouped_functions
+from loopwright.diagrams.flat import flat_diagram, kinds_of
 from loopwright.diagrams.simulation import change_over
 from support.both_forms import assert_same_bits
 
@@ -72,6 +75,21 @@ def parallel(n):
         return made
 
     return sampled(inside)
+
+
+def test_a_run_that_has_ended_is_not_kept_by_the_code_of_the_next_one():
+    flat = parallel(3).flatten()
+    code = compile_code(flat, kinds_of(flat, every=False))
+    x = flat.x0.copy()
+    results = [np.zeros(n) for n in (x.size, flat.plant_inputs.total, flat.log.total, 1)]
+    call = bind_call(
+        next(iter(code.ticks.values())), [np.zeros(1), x, np.zeros(flat.plant_outputs.total), flat.p], results
+    )
+    call()
+    ended = weakref.ref(results[2])
+    del call, results
+    gc.collect()
+    assert ended() is None
 
 
 @pytest.mark.parametrize("n", [1, 2, 15, 16, 17, 32, 35])
