@@ -22,13 +22,11 @@ from .handed_over import HandedOver
 from .hybrid import (
     BrokenOff,
     CompiledHybrid,
-    HybridOutcome,
-    HybridReason,
     Lost,
-    MethodOptions,
     Sign,
     Span,
 )
+from .integration_methods import MethodOptions
 from .kernels import Kernel
 from .library_method import StepFailure
 from .newton import NewtonOptions
@@ -53,8 +51,6 @@ __all__ = [
     "Fired",
     "FusedPlant",
     "HandedOver",
-    "HybridOutcome",
-    "HybridReason",
     "Kernel",
     "Lost",
     "MethodOptions",

@@ -76,11 +76,6 @@ class CompiledFunction(FunctionInC):
     address: int
 
     @property
-    def operations(self) -> int:
-        """Operations of one evaluation."""
-        return int(self.function.n_instructions())
-
-    @property
     def pattern(self) -> tuple[np.ndarray, np.ndarray]:
         """Row and column of each entry of its first result that may not be 0."""
         rows, columns = self.function.sparsity_out(0).get_triplet()
@@ -242,6 +237,42 @@ def address_of(library: ctypes.CDLL, name: str) -> int:
     address = ctypes.cast(library[name], ctypes.c_void_p).value
     assert address is not None
     return address
+
+
+class MemoryForC:
+    """What lives as long as C may read it: vectors, structs and bound functions, which C finds by their addresses."""
+
+    def __init__(self, *kept: Any):
+        self.kept: list[Any] = [*kept]
+
+    def own(self, vector: np.ndarray) -> int | None:
+        """Take a vector, and return its address; None without entries."""
+        self.kept.append(vector)
+        return at(vector)
+
+    def zeros(self, n: int) -> int | None:
+        """Return the address of a new vector."""
+        return self.own(np.zeros(n))
+
+    def array(self, structures: Sequence[ctypes.Structure]) -> int | None:
+        """Return the address of structs, one behind the other; None without any."""
+        if not structures:
+            return None
+        array = (type(structures[0]) * len(structures))(*structures)
+        self.kept.append(array)
+        return ctypes.addressof(array)
+
+    def bind(
+        self,
+        function: FunctionInC,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
+        bind_block: BlockBinder | None = None,
+    ) -> TickStructure:
+        """Return a function that is bound to vectors, as C knows it."""
+        self.kept.append(function.bind(arguments, results, bind_block))
+        structure: TickStructure = self.kept[-1].structure
+        return structure
 
 
 def bind_call(tick: FunctionInC, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Callable[[], None]:

@@ -17,7 +17,7 @@ from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
-from .bound_functions import CALL, TICK, FunctionInC, TickStructure, at
+from .bound_functions import CALL, TICK, MemoryForC, TickStructure, at
 from .diagram_code import DiagramCode
 from .grouped_functions import GroupedTick
 from .newton import NewtonOptions, NewtonStructure
@@ -33,12 +33,18 @@ class ReturnReason(IntEnum):
     """Reasons for which the loop returns: the end of its ticks, or the first tick that Python must look at."""
 
     DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED = range(6)
+    # With continuous states also these, as `instants.c` numbers them.
+    SUSPENDED, ENDED, LOOK, OUTSIDE_FAILED, PILED_UP, BROKEN_OFF = range(6, 12)
 
 
 class OutcomeStructure(ctypes.Structure):
     """Where and why the loop has returned, as C knows it."""
 
     _fields_ = [(name, ctypes.c_int64) for name in ("ticks", "rows", "reason", "plant", "stage", "status")]
+
+    def read(self, t: float = np.nan) -> Outcome:
+        """Return it, with the time that continuous states have reached."""
+        return Outcome(self.ticks, self.rows, ReturnReason(self.reason), self.plant, self.stage, self.status, t)
 
 
 class _Transfer(ctypes.Structure):
@@ -94,6 +100,7 @@ class Outcome(NamedTuple):
     plant: int  # the FMU that it is about, by its place
     stage: int  # setting inputs, the step, reading outputs; then as `plants_called_back`
     status: int  # of that call
+    t: float = np.nan  # in s, that continuous states have reached
 
 
 class CompiledLoop:
@@ -148,14 +155,14 @@ class CompiledLoop:
         self.called = CalledBack()
         self._remote, self._far = RemotePlants(), list[int | None]()
         self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
-        self._kept: list[Any] = [code, arguments, results, plants, columns, exchange]
+        self._memory = memory = MemoryForC(code, arguments, results, plants, columns, exchange)
         self._bind_block = None if exchange is None else exchange.bind_block
         self.calls_python = any(isinstance(t, GroupedTick) and t.calls_python for t in code.ticks.values())
         self._watched: list[tuple[HostState, ctypes.c_bool]] = [] if exchange is None else [*exchange.watched]
         t, x, _, _ = arguments
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
-        ticks = [self._bind(tick, arguments, results) for tick in code.ticks.values()]
+        ticks = [memory.bind(tick, arguments, results, self._bind_block) for tick in code.ticks.values()]
         # The tick after those with code serves all other sets of clocks; C calls Python for it.
         if rest is not None:
             ticks.append(TickStructure(self.called.function(TICK, lambda *_: rest(), 1)))
@@ -166,32 +173,32 @@ class CompiledLoop:
             row=width,
             stops=len(stops),
             every=every,
-            ticks=self._address(ticks, TickStructure),
-            fmus=self._address([self._plant(j, plant) for j, plant in enumerate(plants)], _Plant),
+            ticks=memory.array(ticks),
+            fmus=memory.array([self._plant(j, plant) for j, plant in enumerate(plants)]),
             t=at(t),
             x=at(x),
             x_next=at(x_next),
             log=at(log),
             ok=at(ok),
-            columns=None if columns is None else self._array(np.ascontiguousarray(columns, dtype=np.int64)),
-            stop=self._array(np.array(stops, dtype=np.int64)),
+            columns=None if columns is None else memory.own(np.ascontiguousarray(columns, dtype=np.int64)),
+            stop=memory.own(np.array(stops, dtype=np.int64)),
             truth=TRUE,
             near=NEAR,
         )
         self.structure.apart = self._remote.address
         # One array where plants take their inputs as they are; then C copies nothing.
         if held is not None and held[0] is not held[1]:
-            self.structure.z, self.structure.held = map(self._array, held)
+            self.structure.z, self.structure.held = map(memory.own, held)
             self.structure.inputs = held[0].size
         self._own = _OwnSteps()
         if inputs:
-            self._own.inputs = self._array(np.array([[s.start, s.stop] for s in inputs], dtype=np.int64))
+            self._own.inputs = memory.own(np.array([[s.start, s.stop] for s in inputs], dtype=np.int64))
             self.structure.own = ctypes.addressof(self._own)
         if code.loops:
             solvers = [self.bind_loops(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
             # C indexes solvers by the kind of the tick; the one that Python evaluates solves its loops itself.
             solvers += [NewtonStructure()] * (len(ticks) - len(solvers))
-            self.structure.loops = self._address(solvers, NewtonStructure)
+            self.structure.loops = memory.array(solvers)
         self._outcome = OutcomeStructure()
         self._run = code.run_ticks or load_runtime()["loopwright_run"]
         self._run.restype = None
@@ -200,25 +207,7 @@ class CompiledLoop:
     @property
     def kept(self) -> list[Any]:
         """All that lives as long as the loop: whatever its pointers lead to."""
-        return self._kept
-
-    def _array(self, values: np.ndarray) -> int | None:
-        self._kept.append(values)
-        return at(values)
-
-    def _address(self, structures: Sequence[ctypes.Structure], kind: type[ctypes.Structure]) -> int | None:
-        if not structures:
-            return None
-        array = (kind * len(structures))(*structures)
-        self._kept.append(array)
-        return ctypes.addressof(array)
-
-    def _bind(
-        self, function: FunctionInC, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
-    ) -> TickStructure:
-        bound = function.bind(arguments, results, self._bind_block)
-        self._kept.append(bound)
-        return bound.structure
+        return self._memory.kept
 
     def bind_loops(
         self,
@@ -230,18 +219,18 @@ class CompiledLoop:
         """Return the algebraic loops at a tick, bound to the vectors (t, x, w, p); valid as long as this lives."""
         if clocks not in code.loops or options is None:
             return NewtonStructure()
-        n, where = len(options.where), np.array(options.where, dtype=np.int64)
+        n, where, memory = len(options.where), np.array(options.where, dtype=np.int64), self._memory
         r, J, before = np.zeros(n), np.zeros(n * n), np.zeros(n)
         found = NewtonStructure(
             n=n,
-            equations=self._bind(code.loops[clocks], arguments, [r, J]),
-            where=self._array(where),
-            r=self._array(r),
-            J=self._array(J),
-            before=self._array(before),
-            **{name: self._array(np.zeros(n)) for name in ("v", "direction", "column")},
-            lu=self._array(np.zeros(n * n)),
-            rows=self._array(np.zeros(n, dtype=np.int64)),
+            equations=memory.bind(code.loops[clocks], arguments, [r, J], self._bind_block),
+            where=memory.own(where),
+            r=memory.own(r),
+            J=memory.own(J),
+            before=memory.own(before),
+            **{name: memory.zeros(n) for name in ("v", "direction", "column")},
+            lu=memory.zeros(n * n),
+            rows=memory.own(np.zeros(n, dtype=np.int64)),
             tolerance=options.tolerance,
             rounding=options.rounding,
             singular=max(options.singular, _SEEN if isinstance(code.loops[clocks], SlopesByDifferences) else 0.0),
@@ -260,7 +249,7 @@ class CompiledLoop:
             return 1
 
         found.help = self.called.function(CALL, help_c)
-        self._kept.append(found)
+        memory.kept.append(found)
         return found
 
     def _plant(self, place: int, plant: FmuInstance | PythonStep) -> ctypes.Structure:
@@ -270,7 +259,7 @@ class CompiledLoop:
         step, take = plant.native or plant.remote, partial(_take_step, plant)
         if step is None:
             return _Plant(by_python=self._remote.add_python(place, take, None))
-        self._kept.append(step)
+        self._memory.kept.append(step)
         if isinstance(step, RemoteStep):
             far = self._far[-1] = self._remote.add(step)
             return _Plant(
@@ -394,8 +383,7 @@ class CompiledLoop:
                 at(rows),
                 ctypes.addressof(self._outcome),
             )
-        found = self._outcome
-        return Outcome(found.ticks, found.rows, ReturnReason(found.reason), found.plant, found.stage, found.status)
+        return self._outcome.read()
 
 
 def _take_step(plant: FmuInstance, t: float, h: float) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 
 from ...fmus.export import describe_processor, processor_flags
 from ..flat import NONE, FlatDiagram, TickPattern
-from .bound_functions import CodeOfFunctions, FunctionInC, GeneratedCode, Machine
+from .bound_functions import CodeOfFunctions, CompiledFunction, FunctionInC, GeneratedCode, Machine
 from .compiled_libraries import is_kept, load_compiled
 from .expanded_functions import ExpandedFunctions, LoopEquations
 from .grouped_functions import GroupedFunctions
@@ -41,19 +41,25 @@ class DiagramCode:
     exact: bool
     library: ctypes.CDLL  # loaded as long as this lives
     steps: Mapping[str, int] = field(default_factory=dict)  # addresses of steps that were made for its rates, by method
+    operations_of_rates: int = 0  # of one evaluation
     judged: bool = False  # outputs may be non-finite after a solver's step though states are finite
     run_ticks: Any = None  # goes over ticks; None for the one that all diagrams share
     notes: tuple[str, ...] = ()  # what a run reports of its code
 
+    @property
+    def slope(self) -> CompiledFunction | SlopesByDifferences | None:
+        """The derivative of the rates; None where nobody asks for it."""
+        found = self.between.get("slope")
+        assert found is None or isinstance(found, CompiledFunction | SlopesByDifferences)
+        return found
+
     def hand_over(self, to: DiagramCode) -> None:
         """Let generated code take the place of the virtual machine wherever these functions are bound."""
-        for clocks, tick in self.ticks.items():
-            tick.hand_over(to.ticks[clocks])
-        for clocks, equations in self.loops.items():
-            equations.hand_over(to.loops[clocks])
-        for name, function in self.between.items():
-            if not isinstance(function, SlopesByDifferences):  # their rates are handed over as "flow"
-                function.hand_over(to.between[name])
+        pairs: list[tuple[Mapping[Any, FunctionInC], Mapping[Any, FunctionInC]]]
+        pairs = [(self.ticks, to.ticks), (self.loops, to.loops), (self.between, to.between)]
+        for own, other in pairs:
+            for name, function in own.items():
+                function.hand_over(other[name])
 
 
 class Sources:
@@ -106,6 +112,7 @@ class Sources:
             self.exact or not isinstance(code, GeneratedCode),
             code.library,
             self._functions.find_steps(code),
+            self._functions.operations_of_rates,
             self._judged,
         )
 

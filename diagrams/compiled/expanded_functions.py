@@ -104,6 +104,12 @@ class ExpandedFunctions(_Traced):
         return {method: code.address(step) for method, step in STEPS.items()} if has_steps else {}
 
     @cached_property
+    def operations_of_rates(self) -> int:
+        """Operations of one evaluation of the rates, without those of FMUs."""
+        functions = self._between["flow"].functions if self._between else ()
+        return sum(function.n_instructions() for function in functions)
+
+    @cached_property
     def _columns(self) -> Columns:
         flat = self._flat
         if flat.active_loops(NONE):  # they may lead from each state to each rate

@@ -12,7 +12,7 @@ from weakref import WeakSet
 
 import numpy as np
 
-from ..flat import FlatDiagram, PartProgram, TickPattern, bind_function
+from ..flat import FlatDiagram, TickPattern, bind_function
 from .bound_functions import (
     BlockBinder,
     BoundFunction,
@@ -132,7 +132,6 @@ class GroupedPart(GroupedFunction):
     """A function between ticks: rates, indicators, or states after events."""
 
     tables: PartTables
-    operations: int
 
     def _structure(self, arguments: Sequence[np.ndarray]) -> Any:
         return _PartInC(
@@ -201,7 +200,6 @@ class GroupedFunctions:
         self._parts = {name: flat.part_program(name) for name in between if name != "slope"}
         programs = [tick.program for tick in self._ticks.values()] + [part.program for part in self._parts.values()]
         self._blocks = BlockKinds(flat, programs)
-        self._counts = {name: _count_operations(part) for name, part in self._parts.items()}
         self._tables = dict[Kernels, tuple[dict[frozenset[TickPattern], TickTables], dict[str, PartTables]]]()
         self.operations, self.exact = self._blocks.operations, self._blocks.exact
 
@@ -221,7 +219,7 @@ class GroupedFunctions:
         tick, part = (address_of(load_runtime(), f"loopwright_grouped_{name}") for name in ("tick", "part"))
         ticks = {clocks: GroupedTick(tables, kernels, tick) for clocks, tables in of_ticks.items()}
         between: dict[str, FunctionInC] = {
-            name: GroupedPart(tables, kernels, part, self._counts[name]) for name, tables in of_parts.items()
+            name: GroupedPart(tables, kernels, part) for name, tables in of_parts.items()
         }
         if self._stiff:
             between["slope"] = SlopesByDifferences(between["flow"], self._columns)
@@ -232,11 +230,14 @@ class GroupedFunctions:
         return {}
 
     @cached_property
+    def operations_of_rates(self) -> int:
+        """Operations of one evaluation of the rates."""
+        if "flow" not in self._parts:
+            return 0
+        part = self._parts["flow"]
+        of = part.program.functions
+        return sum(of[op.kernel].n_instructions() for op in part.operations if op.kernel in of)
+
+    @cached_property
     def _columns(self) -> Columns:
         return find_columns(self._parts["flow"], self._flat.continuous)
-
-
-def _count_operations(part: PartProgram) -> int:
-    """Return the operations of one evaluation."""
-    of = part.program.functions
-    return sum(of[op.kernel].n_instructions() for op in part.operations if op.kernel in of)

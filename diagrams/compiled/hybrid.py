@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -12,32 +11,23 @@ import numpy as np
 
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, MethodKind
-from .bound_functions import CALL, CompiledFunction, FunctionInC, TickStructure, at
-from .compiled_loop import CompiledLoop, OutcomeStructure
+from .bound_functions import CALL, MemoryForC, at
+from .compiled_loop import CompiledLoop, Outcome, OutcomeStructure
 from .diagram_code import DiagramCode
+from .differential_equation import DifferentialEquation
 from .event_domains import Domains
-from .grouped_functions import GroupedPart
-from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
-from .library_method import LibraryMethod, StepFailure
-from .newton import NewtonOptions, NewtonStructure
-from .radau import radau_numbers
-from .rate_differences import SlopesByDifferences
+from .hybrid_structures import HybridStructure, SpanStructure
+from .integration_methods import IntegrationMethod, MethodOptions
+from .library_method import StepFailure
+from .newton import NewtonOptions
 from .runtime import load_runtime
 from .staged import NativeModelExchange
-from .staged_functions import Staged
-from .transport_delays import Delays, NativeDelays
+from .transport_delays import Delays
 from .watch import Fired, Pile, Watch
 
 _SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn
 _LIBRARY_STEP = 200_000  # ns that a library takes for a step, about
 _UNKNOWN = 20  # steps of the first call next to FMUs that may take any time
-
-
-class HybridReason(IntEnum):
-    """Reasons for which the loop returns: those of `ReturnReason`, and more."""
-
-    DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED, SUSPENDED, ENDED, LOOK, OUTSIDE_FAILED = range(10)
-    PILED_UP, BROKEN_OFF = range(10, 12)
 
 
 class Lost(IntEnum):
@@ -70,16 +60,6 @@ class BrokenOff(NamedTuple):
     left: float
 
 
-@dataclass(frozen=True, eq=False)
-class MethodOptions:
-    """A method of integration."""
-
-    name: str  # one of `METHODS`
-    rtol: float
-    atol: np.ndarray  # shape (n,)
-    longest: float  # longest step in s; of a method of fixed step, its step
-
-
 class Span(NamedTuple):
     """Ticks and instants that are gone through in one call; times in s."""
 
@@ -92,18 +72,6 @@ class Span(NamedTuple):
     late: np.ndarray  # when these are seen at the instant itself
     steps: StepTable | None = None  # of the plants, that end at each; None: all plants step at each
     stays: bool = False  # the run is at the first tick, so that no plant steps to it
-
-
-class HybridOutcome(NamedTuple):
-    """Where and why the loop has returned; see `Outcome`. ``t`` is the time in s that the states have reached."""
-
-    ticks: int
-    rows: int
-    reason: HybridReason
-    plant: int
-    stage: int
-    status: int
-    t: float
 
 
 class CompiledHybrid:
@@ -165,88 +133,43 @@ class CompiledHybrid:
         coupled: bool = False,
         logged: int | None = None,
     ):
-        self.ticks, self._kept = loop, list[Any]([code, arguments, x_next])
-        self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
-        # Trials have their own t and x; w is the run's, unless delays write their outputs of the trial's time into it.
-        n, width, (_, x, w, p) = flat.continuous.size, flat.width, arguments
-        trial = [np.zeros(1), x.copy(), w if delays is None else w.copy(), p]
-        where = flat.continuous
-        slope = code.between.get("slope")
-        assert slope is None or isinstance(slope, CompiledFunction | SlopesByDifferences)
-        flow = code.between["flow"]
-        assert isinstance(flow, CompiledFunction | GroupedPart | Staged)
-        slopes = np.zeros(0 if slope is None else n * n if loops else len(slope.pattern[0]))
+        n, width = flat.continuous.size, flat.width
+        self.ticks, self.kinds = loop, loop.kinds
+        self._memory = memory = MemoryForC(code, arguments, x_next)
+        self._exchange = exchange
         self._hybrid = hybrid = HybridStructure(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
-        self._exchange, hybrid.looked = exchange, np.nan
-        self._bind_block = None if exchange is None else exchange.bind_block
-        self._solver: NewtonStructure | None = None
-        self._tolerances = list[np.ndarray]()
-        hybrid.budget = self._largest_budget = _budget(flow.operations, methods, n)
+        hybrid.between, hybrid.looked, hybrid.coupled = self.kinds[NONE], np.nan, coupled
+        hybrid.outputs = flat.log.total
+        hybrid.budget = self._largest_budget = _budget(code.operations_of_rates, methods, n)
         if exchange is not None:
             hybrid.budget = min(hybrid.budget, _UNKNOWN)
-        hybrid.between = self.kinds[NONE]
-        hybrid.p = ProblemStructure(
-            n=n,
-            width=width,
-            where=self._own(where.astype(np.int64)),
-            flow=self._bind(flow, trial, [np.zeros(n)]),
-            t=self._own(trial[0]),
-            x=self._own(trial[1]),
-            slopes=self._own(slopes),
+        typical = np.maximum(np.abs(methods[-1].atol) / methods[-1].rtol, 1e-300)
+        self._equation = DifferentialEquation(
+            code,
+            flat,
+            loop,
+            arguments,
+            typical=typical,
+            loops=loops,
+            exchange=exchange,
+            delays=delays,
+            tolerances=tolerances,
         )
-        # Delays put out what went in τ before: C evaluates their inputs at a trial by another function.
-        self._delays: NativeDelays | None = None
-        if delays is not None:
-            driven = np.zeros(flat.plant_inputs.total)
-            self._delays = NativeDelays(
-                delays, self._bind(code.between["driven"], trial, [driven]), driven, w, trial[2], tolerances
-            )
-            hybrid.p.delays = self._delays.address
-        # Algebraic loops are solved at each trial: the slope needs its parts by the loops' values, too.
-        results = [slopes]
+        hybrid.p = self._equation.structure
         if loops is not None:
-            m = len(loops.where)
-            self._solver = loop.bind_loops(code, NONE, trial, loops)
-            hybrid.p.loops, hybrid.p.here = ctypes.addressof(self._solver), at(x)
-            hybrid.solved = self._own(np.zeros(m))
-            if not isinstance(slope, SlopesByDifferences):
-                through = np.zeros(2 * n * m)
-                hybrid.p.by_loops = self._own(through)
-                results += [through[: n * m], through[n * m :], np.zeros(m * m)]
-        if slope is not None:
-            typical = np.maximum(np.abs(methods[-1].atol) / methods[-1].rtol, 1e-300)
-            if isinstance(slope, SlopesByDifferences):
-                bound = slope.bind(trial, results, self._bind_block, typical=typical, loops=self._solver)
-            else:
-                bound = slope.bind(trial, results)
-            hybrid.p.slope = bound.structure
-            self._kept.append(bound)
-            if loops is None or isinstance(slope, SlopesByDifferences):
-                rows, columns = slope.pattern
-                hybrid.p.entries = len(rows)
-                hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
+            hybrid.solved = memory.zeros(len(loops.where))
         # Each method integrates the one problem; those of libraries are asked for steps by a callback into Python.
-        of = ctypes.addressof(hybrid) + HybridStructure.p.offset
-        self.methods = [self._method(options, n, of, code.steps.get(options.name)) for options in methods]
-        self._names = [options.name for options in methods]
-        self._libraries = {
-            i: LibraryMethod(one.name, one.rtol, one.atol, one.longest, flat.continuous_labels, hybrid.p, method)
-            for i, (one, method) in enumerate(zip(methods, self.methods, strict=True))
-            if METHODS[one.name].kind is MethodKind.LIBRARY
-        }
-        if self._libraries:
-            loop.calls_python = True
+        labels = flat.continuous_labels
+        self.methods = [IntegrationMethod(one, hybrid.p, labels, code.steps.get(one.name)) for one in methods]
         for i, method in enumerate(self.methods):
-            hybrid.methods[i] = ctypes.addressof(method)
-        hybrid.before, hybrid.p.beyond = self._own(np.zeros(width)), self._own(np.zeros(n))
-        self._beyond: np.ndarray = self._kept[-1]
-        self._trial, self._where = trial, where
+            hybrid.methods[i] = ctypes.addressof(method.structure)
+            loop.calls_python = loop.calls_python or method.library is not None
+        hybrid.before = memory.zeros(width)
         hybrid.drain = loop.called.function(CALL, drain)
-        hybrid.coupled = coupled
-        hybrid.outputs = flat.log.total
         # Events come last: their jumps read the vectors above, and those of FMUs in model exchange fire with them.
         self.watch: Watch | None = None
         """The events; None without any."""
+        trial = self._equation.trial
         if domains is not None:
             size = {} if logged is None else {"logged": logged}
             self.watch = Watch(
@@ -255,15 +178,16 @@ class CompiledHybrid:
             hybrid.w = self.watch.structure
         if exchange is not None:
             fired = np.zeros(0) if self.watch is None else self.watch.fired
-            exchange.structure.jump = self._bind(code.between["jump"], [*arguments, fired], [x_next])
+            jump = memory.bind(code.between["jump"], [*arguments, fired], [x_next], exchange.bind_block)
+            exchange.structure.jump = jump
             hybrid.o = ctypes.addressof(exchange.structure)
         taken = [*(flat.taken_at(clocks) for clocks in self.kinds), np.arange(width)]
-        self.taken_states = self._zeros(width)
+        self.taken_states = np.zeros(width)
         """All states that a tick leaves, before the events behind it."""
         self._taken = np.concatenate([np.zeros(0), *taken]).astype(np.int64)
         self._taken_first = np.cumsum([0, *map(len, taken)]).astype(np.int64)
-        hybrid.taken, hybrid.taken_first = self._own(self._taken), self._own(self._taken_first)
-        hybrid.taken_states = self._own(self.taken_states)
+        hybrid.taken, hybrid.taken_first = memory.own(self._taken), memory.own(self._taken_first)
+        hybrid.taken_states = memory.own(self.taken_states)
         self._outcome = OutcomeStructure()
         library = load_runtime()
         self._run, self._run_between, self._note_beyond = (
@@ -271,7 +195,8 @@ class CompiledHybrid:
         )
         self._run.restype = self._run_between.restype = self._note_beyond.restype = None
         self._guard = loop.guard
-        self._fresh = [(structure, bytes(structure)) for structure in (hybrid, *self.methods)]
+        structures = (hybrid, *(method.structure for method in self.methods))
+        self._fresh = [(structure, bytes(structure)) for structure in structures]
 
     @property
     def structure(self) -> HybridStructure:
@@ -282,8 +207,8 @@ class CompiledHybrid:
     def kept(self) -> list[Any]:
         """All that lives as long as the loop: whatever its pointers lead to."""
         events = [] if self.watch is None else self.watch.kept
-        solver = [] if self._solver is None else [self._solver]
-        return [*self.ticks.kept, *self._kept, *events, *solver, *self.methods]
+        methods = [part for method in self.methods for part in (method.structure, method.kept)]
+        return [*self.ticks.kept, *self._memory.kept, *self._equation.kept, *events, *methods]
 
     def note_taken(self, states: np.ndarray) -> None:
         """Note which states the tick renews that Python has just evaluated for C; see `CompiledLoop`."""
@@ -295,72 +220,9 @@ class CompiledHybrid:
         """Forget the run before: methods have no step in mind, and no sign of stiffness has been seen."""
         for structure, content in self._fresh:
             ctypes.memmove(ctypes.addressof(structure), content, len(content))
-        for library in self._libraries.values():
-            library.begin_again()
-
-    def _zeros(self, n: int) -> np.ndarray:
-        self._kept.append(np.zeros(n))
-        return self._kept[-1]  # type: ignore[no-any-return]
-
-    def _own(self, values: np.ndarray) -> int | None:
-        self._kept.append(values)
-        return at(values)
-
-    def _bind(
-        self, function: FunctionInC, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
-    ) -> TickStructure:
-        bound = function.bind(arguments, results, self._bind_block)
-        self._kept.append(bound)
-        return bound.structure
-
-    def _method(self, options: MethodOptions, n: int, of: int, step: int | None) -> MethodStructure:
-        import scipy.integrate
-
-        name, facts = options.name, METHODS[options.name]
-        made = MethodStructure(
-            kind=facts.kind,
-            stages=facts.stages,
-            n=n,
-            of=of,
-            rtol=options.rtol,
-            longest=options.longest,
-            planned=np.nan,
-            step=step,
-        )
-        self._tolerances.append(np.broadcast_to(options.atol, (n,)).astype(float))
-        made.atol = self._own(self._tolerances[-1])
-        # SciPy has the coefficients; C has the steps, the norms and the control.
-        if name in ("RK23", "RK45", "DOP853"):
-            of_scipy = getattr(scipy.integrate, name)
-            stages = made.stages = of_scipy.n_stages
-            made.exponent = of_scipy.error_estimator_order
-            A = np.zeros((stages, stages))
-            A[:, : of_scipy.A.shape[1]] = of_scipy.A
-            made.A, made.B, made.C = (self._own(np.array(a, dtype=float)) for a in (A, of_scipy.B, of_scipy.C))
-            if name == "DOP853":
-                made.extra, made.order = len(of_scipy.C_EXTRA), 7
-                made.E, made.E3, made.P = (
-                    self._own(np.array(a, dtype=float)) for a in (of_scipy.E5, of_scipy.E3, of_scipy.D)
-                )
-                made.A_extra, made.C_extra = (
-                    self._own(np.array(a, dtype=float)) for a in (of_scipy.A_EXTRA, of_scipy.C_EXTRA)
-                )
-            else:
-                made.order = of_scipy.P.shape[1]
-                made.E, made.P = (self._own(np.array(a, dtype=float)) for a in (of_scipy.E, of_scipy.P))
-        elif name == "Radau":
-            made.order, made.exponent = 3, 3
-            made.A = self._own(radau_numbers())
-            made.tolerance = max(10 * np.finfo(float).eps / options.rtol, min(0.03, options.rtol**0.5))
-            made.J, made.lu, made.lu_complex = (self._own(np.zeros(k * n * n)) for k in (1, 1, 2))
-            made.Z, made.W, made.F = (self._own(np.zeros(3 * n)) for _ in range(3))
-            made.error, made.scale = (self._own(np.zeros(n)) for _ in range(2))
-            made.pivots, made.pivots_complex = (self._own(np.zeros(n, dtype=np.int64)) for _ in range(2))
-        # K: stages, at most 16, those of DOP853 with its end and three for the dense output D.
-        for field in ("x", "x_old", "f", "y", "g"):
-            setattr(made, field, self._own(np.zeros(n)))
-        made.K, made.D = self._own(np.zeros(17 * n)), self._own(np.zeros(7 * n))
-        return made
+        for method in self.methods:
+            if method.library is not None:
+                method.library.begin_again()
 
     # --- continuing ------------------------------------------------------------------------------------------------
 
@@ -394,20 +256,18 @@ class CompiledHybrid:
 
     def take_steps(self, steps: Mapping[str, int]) -> None:
         """Take generated steps of the methods, by name; to the last bit they do what the methods do."""
-        for method, name in zip(self.methods, self._names, strict=True):
-            method.step = steps.get(name)
+        for method in self.methods:
+            method.structure.step = steps.get(method.name)
 
     def plan(self, steps: Sequence[float | None]) -> None:
         """Let the methods take steps of some lengths in s next; None: they choose their first step."""
         for method, step in zip(self.methods, steps, strict=True):
-            method.planned = np.nan if step is None else step
+            method.structure.planned = np.nan if step is None else step
 
     def set_tolerances(self, methods: Sequence[MethodOptions]) -> None:
         """Take other absolute tolerances of the methods."""
-        for i, (vector, options) in enumerate(zip(self._tolerances, methods, strict=True)):
-            vector[:] = options.atol
-            if i in self._libraries:
-                self._libraries[i].set_absolute_tolerance(options.atol)
+        for method, options in zip(self.methods, methods, strict=True):
+            method.set_absolute_tolerance(options.atol)
 
     def limit_budget(self, spent: float) -> None:
         """Let calls take fewer steps if one has taken long, in s; FMUs may take any time for an evaluation."""
@@ -418,7 +278,8 @@ class CompiledHybrid:
 
     def take_failure(self) -> StepFailure | None:
         """Return why a method of another library could not take the last step; None if nothing failed."""
-        return next((failure for one in self._libraries.values() if (failure := one.take_failure())), None)
+        libraries = [method.library for method in self.methods if method.library is not None]
+        return next((failure for one in libraries if (failure := one.take_failure())), None)
 
     @property
     def active(self) -> int:
@@ -438,7 +299,8 @@ class CompiledHybrid:
     def broken_off(self) -> BrokenOff:
         """Return where and why the loop has broken off."""
         hybrid = self._hybrid
-        problem, method, n = hybrid.p, self.methods[hybrid.active], self._where.size
+        problem, method, n = hybrid.p, self.methods[hybrid.active].structure, hybrid.p.n
+        where = self._equation.where
         lost, step = Lost(problem.lost), float(problem.beyond_t)
         with self._guard():
             if lost is Lost.IN_STEP:
@@ -451,14 +313,14 @@ class CompiledHybrid:
         return BrokenOff(
             lost,
             clocks,
-            self._names[hybrid.active],
+            self.methods[hybrid.active].name,
             method.t_old,
             method.t,
             x_old,
             x,
-            float(self._trial[0][0]),
-            self._trial[1][self._where].copy(),
-            None if beyond is None else (beyond, self._beyond.copy()),
+            float(self._equation.trial[0][0]),
+            self._equation.trial[1][where].copy(),
+            None if beyond is None else (beyond, self._equation.beyond.copy()),
             step,
             problem.edge,
             problem.left,
@@ -472,7 +334,8 @@ class CompiledHybrid:
     @property
     def planned(self) -> list[float | None]:
         """Steps in s that the methods would take next."""
-        return [None if np.isnan(method.planned) else float(method.planned) for method in self.methods]
+        planned = [method.structure.planned for method in self.methods]
+        return [None if np.isnan(step) else float(step) for step in planned]
 
     @property
     def skip(self) -> int:
@@ -486,18 +349,18 @@ class CompiledHybrid:
     @property
     def counts(self) -> tuple[int, int, int, int]:
         """Steps that were taken and rejected, and evaluations of the rates and of their derivative."""
-        steps, rejected = (sum(getattr(m, name) for m in self.methods) for name in ("steps", "rejected"))
+        steps, rejected = (sum(getattr(m.structure, name) for m in self.methods) for name in ("steps", "rejected"))
         return steps, rejected, self._hybrid.p.rates, self._hybrid.p.jacobians
 
-    def run(self, span: Span, rows: np.ndarray) -> HybridOutcome:
+    def run(self, span: Span, rows: np.ndarray) -> Outcome:
         """Go through ticks and instants between them, at most as many as ``rows``, each t in s, then values."""
         return self._go(self._run, span, rows, self._outcome)
 
-    def run_between(self, span: Span, rows: np.ndarray) -> HybridOutcome:
+    def run_between(self, span: Span, rows: np.ndarray) -> Outcome:
         """Go to the end of a span, before a tick there, while `run` waits for the plants; see `run`."""
         return self._go(self._run_between, span, rows, OutcomeStructure())
 
-    def _go(self, run: Any, span: Span, rows: np.ndarray, found: OutcomeStructure) -> HybridOutcome:
+    def _go(self, run: Any, span: Span, rows: np.ndarray, found: OutcomeStructure) -> Outcome:
         given = SpanStructure(
             count=len(span.widths),
             times=at(span.times),
@@ -513,15 +376,14 @@ class CompiledHybrid:
         )
         if span.steps is not None:
             self.ticks.set_steps(span.steps)
-        if self._delays is not None:
-            self._delays.hand_over(self._hybrid.t)
+        delays = self._equation.delays
+        if delays is not None:
+            delays.hand_over(self._hybrid.t)
         with self._guard():
             run(ctypes.byref(self._hybrid), ctypes.byref(given), ctypes.c_void_p(at(rows)), ctypes.byref(found))
-        if self._delays is not None:
-            self._delays.take_back()
-        return HybridOutcome(
-            found.ticks, found.rows, HybridReason(found.reason), found.plant, found.stage, found.status, self._hybrid.t
-        )
+        if delays is not None:
+            delays.take_back()
+        return found.read(self._hybrid.t)
 
 
 def _budget(flow: int, methods: Sequence[MethodOptions], n: int) -> int:

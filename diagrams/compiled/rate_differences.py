@@ -68,6 +68,8 @@ class SlopesByDifferences(FunctionInC):
     rates: FunctionInC
     columns: Columns
     values: bool = False
+    typical: np.ndarray | None = None  # sizes of the entries of x below which steps don't become smaller; None: 1
+    loops: NewtonStructure | None = None  # algebraic loops of a run, which are solved wherever entries are moved to
 
     @property
     def pattern(self) -> tuple[np.ndarray, np.ndarray]:
@@ -75,22 +77,12 @@ class SlopesByDifferences(FunctionInC):
         return self.columns.pattern
 
     def bind(
-        self,
-        arguments: Sequence[np.ndarray],
-        results: Sequence[np.ndarray],
-        bind_block: BlockBinder | None = None,
-        *,
-        typical: np.ndarray | None = None,
-        loops: NewtonStructure | None = None,
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
     ) -> BoundFunction:
-        """Return it bound to vectors, for one call at a time.
-
-        ``typical`` are sizes of the entries of x below which steps don't become smaller, 1 without them; ``loops`` are
-        solved wherever these are moved to.
-        """
-        of, n = self.columns, len(self.columns.where)
+        """Return it bound to vectors, for one call at a time."""
+        of, n, loops = self.columns, len(self.columns.where), self.loops
         dx, before, step = np.zeros(n), np.zeros(n), np.zeros(n)
-        sizes, values = np.ones(n) if typical is None else typical, np.zeros(0 if loops is None else loops.n)
+        sizes, values = np.ones(n) if self.typical is None else self.typical, np.zeros(0 if loops is None else loops.n)
         bound = self.rates.bind(arguments, [dx], bind_block)
         structure = _DifferencesInC(
             rates=ctypes.addressof(bound.structure),

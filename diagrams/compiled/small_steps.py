@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
-
 from ...fmus.runtime import read_sources
 from ..flat import share_terms
 from .generated_text import write_functions
+from .method_coefficients import error_exponent, tableau
 
 STEPS = {"rk4": "step_rk4", "RK23": "step_rk23", "RK45": "step_rk45"}
 """Names of the C functions, by method."""
@@ -36,20 +35,15 @@ def write_steps(rates: Any, where: Sequence[int]) -> str:
 @lru_cache(maxsize=1)
 def _embedded() -> str:
     """Return the steps of embedded methods, with the coefficients of SciPy's methods."""
-    from scipy.integrate import RK23, RK45
-
-    return "".join(_write_embedded(name, method) for name, method in (("RK23", RK23), ("RK45", RK45)))
+    return "".join(map(_write_embedded, ("RK23", "RK45")))
 
 
-def _write_embedded(name: str, method: Any) -> str:
-    stages = method.n_stages
-    A = np.zeros((stages, stages))
-    A[:, : method.A.shape[1]] = method.A
-    tables = {"A": A.ravel(), "B": method.B, "C": method.C, "E": method.E}
+def _write_embedded(name: str) -> str:
+    found = tableau(name)
     texts = [
-        f"    static const double {letter}[] = {{{', '.join(map(float.hex, map(float, values)))}}};\n"
-        for letter, values in tables.items()
+        f"    static const double {letter}[] = {{{', '.join(map(float.hex, found[letter].ravel().tolist()))}}};\n"
+        for letter in "ABCE"
     ]
-    numbers = f"{stages}, A, B, C, E, NULL, {float(method.error_estimator_order)}"
+    numbers = f"{len(found['B'])}, A, B, C, E, NULL, {float(error_exponent(name))}"
     call = f"    return step_small(m, &(lw_tableau){{{numbers}}});\n"
     return f"\nVISIBLE int {STEPS[name]}(method *m) {{\n" + "".join(texts) + call + "}\n"

@@ -15,7 +15,7 @@ from ...fmus.calls import BoundCalls, ModelExchangeInstance, NativeAction, Nativ
 from ...fmus.host_state import HostState
 from ..flat import JUMP, OpaqueStage
 from ..model_exchange import OWN_EVENTS
-from .bound_functions import CALL, TickStructure, at
+from .bound_functions import CALL, MemoryForC, TickStructure, at
 from .plants_called_back import LateReplies, RemotePlants
 
 _LOGGED = 2**20  # bytes of events in a call
@@ -126,7 +126,7 @@ class NativeModelExchange:
         width: int,
         by_python: Callable[[OpaqueStage, EvaluationVectors], Callable[[], int]],
     ):
-        self._blocks, self._width, self._kept, self._by_python = blocks, width, list[Any](), by_python
+        self._blocks, self._width, self._memory, self._by_python = blocks, width, MemoryForC(), by_python
         self.called = CalledBack()
         """Calls of Python, with the error that has ended a run."""
         self.paths = [*blocks]
@@ -159,10 +159,6 @@ class NativeModelExchange:
                 e.changed = ctypes.addressof(self.watched[-1][1])
         self._inputs = dict[str, np.ndarray]()
         self._final, self._finals = dict[str, Any](), dict[str, Any]()
-
-    def _own(self, vector: np.ndarray) -> int | None:
-        self._kept.append(vector)
-        return at(vector)
 
     # --- binding -----------------------------------------------------------------------------------------------------
 
@@ -200,11 +196,11 @@ class NativeModelExchange:
         fmu.width, fmu.again, fmu.terminate, fmu.nominals = answers[:4]
         fmu.defined, fmu.time, fmu.wants, fmu.ends, fmu.again_where = answers[4:]
         self._inputs[path] = np.zeros(fmu.inputs)
-        fmu.u = self._own(self._inputs[path])
+        fmu.u = self._memory.own(self._inputs[path])
         fmu.least, fmu.relative, fmu.low, fmu.high = (
-            self._own(np.ascontiguousarray(v)) for v in (look.least, look.relative, look.low, look.high)
+            self._memory.own(np.ascontiguousarray(v)) for v in (look.least, look.relative, look.low, look.high)
         )
-        fmu.discrete = self._own(look.discrete.astype(np.uint8))
+        fmu.discrete = self._memory.own(look.discrete.astype(np.uint8))
 
     def _sequence(self, path: str, actions: Sequence[NativeAction]) -> _ActionsInC:
         made = (_Action * len(actions))()
@@ -218,10 +214,14 @@ class NativeModelExchange:
                 self._warned.append((path, action.names, np.full(len(action.names), np.nan)))
                 structure.warned_at = at(self._warned[-1][2])
             structure.arguments[: len(action.arguments)] = action.arguments
-            structure.vector, structure.index, structure.buffer = action.vector, self._own(action.places), action.buffer
+            structure.vector, structure.index, structure.buffer = (
+                action.vector,
+                self._memory.own(action.places),
+                action.buffer,
+            )
             structure.low, structure.high = action.low, action.high
             self._names[ctypes.addressof(structure)] = action.names
-        self._kept.append(made)
+        self._memory.kept.append(made)
         self._actions.append((path, made, [*actions]))
         return _ActionsInC(len(made), ctypes.addressof(made) if actions else None)
 

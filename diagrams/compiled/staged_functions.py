@@ -26,11 +26,6 @@ class Staged(FunctionInC):
     schedule: Schedule
     functions: Sequence[CompiledFunction]
 
-    @property
-    def operations(self) -> int:
-        """Operations of one evaluation, without those of the FMUs."""
-        return sum(function.operations for function in self.functions)
-
     def bind(
         self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
     ) -> BoundFunction:

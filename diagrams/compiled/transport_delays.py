@@ -20,7 +20,7 @@ import numpy as np
 from ...blocks.core import ShapeError, is_before
 from ..flat import FlatDiagram
 from ..wiring import join
-from .bound_functions import TickStructure, at
+from .bound_functions import MemoryForC, TickStructure, at
 from .hybrid_structures import DelaysStructure
 
 _NODES = 9
@@ -180,7 +180,7 @@ class NativeDelays:
         trial: np.ndarray,
         tolerances: tuple[float, float],
     ):
-        self._past, self._kept = past, list[Any]([driven, z, here, trial])
+        self._past, self._memory = past, MemoryForC(driven, z, here, trial)
         self.structure = DelaysStructure(
             n=len(past.taus),
             distinct=len(set(past.taus)),
@@ -205,8 +205,7 @@ class NativeDelays:
         )
 
     def _own(self, values: Sequence[Any] | np.ndarray, kind: type = float) -> int | None:
-        self._kept.append(np.array(values, dtype=kind))
-        return at(self._kept[-1])
+        return self._memory.own(np.array(values, dtype=kind))
 
     @property
     def address(self) -> int:

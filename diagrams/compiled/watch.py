@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..flat import FlatDiagram
-from .bound_functions import FunctionInC, TickStructure, at
+from .bound_functions import FunctionInC, MemoryForC, TickStructure
 from .event_domains import Domains
 from .staged import NativeModelExchange
 
@@ -101,7 +101,8 @@ class Watch:
         exchange: NativeModelExchange | None = None,
         logged: int = _LOGGED,
     ):
-        self._kept: list[Any] = []
+        self._memory = memory = MemoryForC()
+        bind_block = None if exchange is None else exchange.bind_block
         events, n = flat.events, flat.continuous.size
         m = self._m = len(events)
         self._width = flat.width
@@ -110,12 +111,9 @@ class Watch:
         z, opened, fired = np.zeros(m), np.zeros(m), np.zeros(m)
         for name, vectors in {"z": z, "open": opened, "fired": fired}.items():
             self._put(name, vectors)
-        indicators = functions["indicators"].bind(trial, [z, opened], None if exchange is None else exchange.bind_block)
-        self.structure.indicators = indicators.structure
-        self._kept.append(indicators)
+        self.structure.indicators = memory.bind(functions["indicators"], trial, [z, opened], bind_block)
         if exchange is None:  # blocks in model exchange look at every instant: their jumps are theirs, see `hybrid`
-            self._kept.append(functions["jump"].bind([*here, fired], [x_next]))
-            self.structure.jump = self._kept[-1].structure
+            self.structure.jump = memory.bind(functions["jump"], [*here, fired], [x_next])
         self.fired = fired
         """Which events fire in a jump, from 0 to 1."""
         flags = {
@@ -153,11 +151,10 @@ class Watch:
     @property
     def kept(self) -> list[Any]:
         """All that lives as long as it: whatever the pointers of its structure lead to."""
-        return self._kept
+        return self._memory.kept
 
     def _put(self, name: str, vector: np.ndarray) -> None:
-        self._kept.append(vector)
-        setattr(self.structure, name, at(vector))
+        setattr(self.structure, name, self._memory.own(vector))
 
     def _put_resets(self, flat: FlatDiagram) -> None:
         """Tell C the events that reset a subsystem: its gate among the states, and the events inside it."""

@@ -17,8 +17,8 @@ from ..compiled import (
     CompiledHybrid,
     DiagramCode,
     HandedOver,
-    HybridOutcome,
-    HybridReason,
+    Outcome,
+    ReturnReason,
     Sign,
     Span,
     code_sources,
@@ -147,13 +147,13 @@ class HybridTicks:
                 k = int(done[-1])
                 self._plants.arrive(k, last)
                 landed = np.flatnonzero(lands[: found.ticks])
-                in_step = found.reason is HybridReason.FMU_FAILED
+                in_step = found.reason is ReturnReason.FMU_FAILED
                 over = landed.size and arrived(int(done[landed[-1]]), in_step)
-                if over and found.reason is not HybridReason.ENDED:
+                if over and found.reason is not ReturnReason.ENDED:
                     return None
-            if found.reason is HybridReason.ENDED:
+            if found.reason is ReturnReason.ENDED:
                 return t
-            if found.reason in (HybridReason.FMU_FAILED, HybridReason.FMU_FLAGS):
+            if found.reason in (ReturnReason.FMU_FAILED, ReturnReason.FMU_FLAGS):
                 following = int(rest[0])
                 self._step_plants(loop, found, k, following, last)
                 if self._plants.ended is not None:
@@ -165,7 +165,7 @@ class HybridTicks:
             progress(t)
         return None
 
-    def _step_plants(self, loop: CompiledHybrid, found: HybridOutcome, k: int, following: int, last: int) -> None:
+    def _step_plants(self, loop: CompiledHybrid, found: Outcome, k: int, following: int, last: int) -> None:
         """Let Python continue with the steps of the plants."""
         try:
             self._plants.continue_steps(loop.ticks, found, k, following, last)
@@ -217,13 +217,13 @@ class HybridTicks:
                 found = loop.run_between(Span(ends, np.diff(ends), kinds, lands, end, *edges), none)
                 self._look_at(loop, found)
                 t = found.t
-                if found.reason in (HybridReason.ENDED, HybridReason.DONE):
-                    return t if found.reason is HybridReason.ENDED else None
+                if found.reason in (ReturnReason.ENDED, ReturnReason.DONE):
+                    return t if found.reason is ReturnReason.ENDED else None
         finally:
             loop.skip = skip
             self._take_back(loop)
 
-    def _call(self, loop: CompiledHybrid, span: Span, recorder: Recorder) -> HybridOutcome:
+    def _call(self, loop: CompiledHybrid, span: Span, recorder: Recorder) -> Outcome:
         """Let C continue, and take note of what has happened; see `_look_at`."""
         rows = recorder.room(float(span.times[0]))
         loop.skip = recorder.skip
@@ -232,27 +232,27 @@ class HybridTicks:
         self._look_at(loop, found)
         return found
 
-    def _look_at(self, loop: CompiledHybrid, found: HybridOutcome) -> None:
+    def _look_at(self, loop: CompiledHybrid, found: Outcome) -> None:
         """Take note of what has happened."""
         loop.ticks.check()
         self._report()
         failure = loop.take_failure()
-        if failure is not None and found.reason is not HybridReason.OUTSIDE_FAILED:
+        if failure is not None and found.reason is not ReturnReason.OUTSIDE_FAILED:
             raise explain_library(self._continuous, failure)
-        if found.reason is HybridReason.BROKEN_OFF:
+        if found.reason is ReturnReason.BROKEN_OFF:
             raise explain(self._continuous, loop.broken_off())
         if loop.ticks.calls_python:
             forget_trials(self._flat)  # an interrupt of a block of Python is raised
-        if found.reason is HybridReason.OUTSIDE_FAILED:
+        if found.reason is ReturnReason.OUTSIDE_FAILED:
             assert self._handed is not None
             self._handed.judge()
-        if found.reason is HybridReason.PILED_UP:
+        if found.reason is ReturnReason.PILED_UP:
             self._take_back(loop)
             raise pile_up(self._continuous, loop, found.t)
         if self._handed is not None and self._handed.has_news():
             self._take_back(loop)
             self._hand_over(loop, found.t)
-        if found.reason is HybridReason.LOOK:
+        if found.reason is ReturnReason.LOOK:
             self._take_back(loop)
             self._choose_method(found.t, *loop.take_sign())
             self._hand_over(loop, found.t)

@@ -14,7 +14,6 @@ from ..compiled import (
     TAKEN_BY_PYTHON,
     UNDER_WAY,
     CompiledLoop,
-    HybridOutcome,
     Outcome,
     PythonStep,
     ReturnReason,
@@ -100,9 +99,7 @@ class PlantsInC:
         shape = 1, len(self._plants)
         return StepTable(np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=np.uint8))
 
-    def continue_steps(
-        self, loop: CompiledLoop, found: Outcome | HybridOutcome, k: int, following: int, last: int
-    ) -> None:
+    def continue_steps(self, loop: CompiledLoop, found: Outcome, k: int, following: int, last: int) -> None:
         """Continue with the steps from a visited tick to the next one, from the plant on that C could not go beyond."""
         if found.stage == REFUSED:
             self.go(k, following, last)
@@ -125,7 +122,7 @@ class PlantsInC:
             else:
                 assert found.stage != UNDER_WAY
                 assert isinstance(plant, FmuInstance)
-                status = found.status if int(found.reason) == ReturnReason.FMU_FAILED else 0
+                status = found.status if found.reason is ReturnReason.FMU_FAILED else 0
                 rest.append(partial(_judge, plant, found.stage, status, *due[path]))
         if self.steps.apart:
             end_all(rest)

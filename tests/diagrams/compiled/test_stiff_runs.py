@@ -7,7 +7,7 @@ from scipy.linalg import block_diag, expm
 
 from loopwright.blocks import Block, Event, State, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled.radau import radau_numbers
+from loopwright.diagrams.compiled.method_coefficients import radau_numbers
 
 QUIET = {"progress": False}
 T = 1e-3

@@ -1,6 +1,9 @@
-"""Numbers of the method Radau IIA with three stages."""
+"""Coefficients of methods of integration: those of SciPy's embedded methods, and of Radau IIA."""
 
 from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +18,29 @@ T_INVERSE = (
     (-4.1787185915519047273, -0.32768282076106238708, 0.47662355450055045196),
     (0.50287263494578687595, -2.5719269498556054292, 0.59603920482822492497),
 )
+
+
+@lru_cache(maxsize=3)
+def tableau(name: str) -> dict[str, np.ndarray]:
+    """Return the coefficients of an embedded method of SciPy, by the names that C has for them, as floats."""
+    import scipy.integrate  # only a run between ticks needs it
+
+    method: Any = getattr(scipy.integrate, name)
+    found = {"A": np.zeros((method.n_stages, method.n_stages)), "B": method.B, "C": method.C}
+    found["A"][:, : method.A.shape[1]] = method.A
+    if name == "DOP853":
+        found |= {"E": method.E5, "E3": method.E3, "P": method.D, "A_extra": method.A_EXTRA, "C_extra": method.C_EXTRA}
+    else:
+        found |= {"E": method.E, "P": method.P}
+    return {letter: np.array(values, dtype=float) for letter, values in found.items()}
+
+
+def error_exponent(name: str) -> int:
+    """Return the order of the error estimate of an embedded method."""
+    import scipy.integrate
+
+    order: int = getattr(scipy.integrate, name).error_estimator_order
+    return order
 
 
 def radau_numbers() -> np.ndarray:
