@@ -8,7 +8,7 @@ from typing import Any
 
 import casadi as ca
 
-from ...fmus.export import CFunction, ComputedNumbers, Slopes
+from ...fmus.export import CFunction, ComputedNumbers, LoopSlopes
 from ..flat import FlatDiagram, TickPattern, speed_up
 
 VECTORS = ("t", "x", "w", "p")
@@ -22,7 +22,7 @@ def trace_slopes(
     start: Any,
     *,
     rates: bool,
-) -> tuple[Slopes | None, list[Any], dict[tuple[str, int], frozenset[tuple[str, int]]]]:
+) -> tuple[LoopSlopes | None, list[Any], dict[tuple[str, int], frozenset[tuple[str, int]]]]:
     """Return the derivatives of a diagram, their functions, and on what each value depends.
 
     ``numbers``: numbers that are computed from parameters, whose derivatives are those by the parameters.
@@ -69,7 +69,7 @@ def trace_slopes(
             ]
     except (RuntimeError, NotImplementedError):  # an operation that CasADi can't differentiate
         return None, [], {}
-    made = Slopes(
+    made = LoopSlopes(
         tuple(CFunction.of(f) for f in forward),
         tuple(CFunction.of(f) for f in reverse),
         tuple(CFunction.of(f) for f in at_start),

@@ -7,7 +7,7 @@ from .fmu_package import build_fmu, clear_cache
 from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
 from .loop_memory import Field, LoopMemory
-from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, Slopes, write_unit
+from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSlopes, LoopSpec, Placed, write_unit
 from .merged_plants import MergedPlant, PlacedPlant
 from .model_spec import INTEGRATORS, Integrator, ModelSpec, Variable, check_ascii
 from .own_sources import read_own_sources
@@ -37,6 +37,7 @@ __all__ = [
     "Kept",
     "Lookup",
     "LoopMemory",
+    "LoopSlopes",
     "LoopSpec",
     "MergedPlant",
     "ModelSpec",
@@ -44,7 +45,6 @@ __all__ = [
     "Placed",
     "PlacedPlant",
     "ProcessorMeasurement",
-    "Slopes",
     "TargetCode",
     "TargetMeasurement",
     "TargetNumbers",

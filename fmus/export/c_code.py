@@ -12,17 +12,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 
-from ...blocks.core import DefinitionError, lay_out, rate_of
+from ...blocks.core import DefinitionError
 from ..runtime import read_sources
 from .c_text import c_array
 from .elementary_tables import prepare_functions, restore_functions
-from .model_spec import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
+from .entries import Entry, layout
+from .model_spec import DIRECTIONS, ModelSpec
 
-Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "derivative", "output", "indicator"]
 _SHARED = ("linear.c", "fixed_step.c", "embedded.c", "crossings.c")  # of loopwright.fmus.runtime
 _COMMON = ("model.h", "elementary.c", "core.c", "integrators.c", "events.c", "stepping.c")
 RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
@@ -33,110 +33,6 @@ _SCALAR_LIMIT = 20_000
 # Longest function of the rates that is inlined into every stage of the integrators; the compiler alone would call it.
 _INLINE_LIMIT = 300
 _INLINE = "static inline __attribute__((always_inline))"
-_STEP_DESCRIPTION = (
-    "Longest step of the explicit Runge-Kutta method of order 4 (integrator = 1); a communication step h, or its "
-    "remainder after an event, takes ceil(h / internal_step) equal substeps, at least one"
-)
-_INTEGRATOR_DESCRIPTION = (
-    "Integrator of Co-Simulation. 1: explicit Runge-Kutta, order 4, fixed step; 2: explicit Runge-Kutta, order 5(4), "
-    "adaptive; 3: implicit (Rosenbrock), order 4(3), adaptive, for stiff models"
-)
-_TOLERANCE_DESCRIPTION = (
-    "Relative tolerance of the adaptive integrators; times a state's nominal value, its absolute one"
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Entry:
-    """Variable of the FMU; its value reference is its index in the table of variables.
-
-    ``kind``: one of time, fixed, tunable, input, state, discrete (state), derivative, output, (event) indicator.
-    ``variable``: the model's variable; of time and of derivatives only name, unit, shape and description count.
-    ``name``: name in the FMU: ``der(x)`` for the derivative of ``x``.
-    ``first``: index of its first element in the values of an instance.
-    """
-
-    reference: int
-    kind: Kind
-    variable: Variable
-    name: str
-    first: int
-    of: int | None = None
-
-    @property
-    def is_output(self) -> bool:
-        """Whether it is an output, computed or a state."""
-        return self.variable.causality == "output" and self.kind in ("state", "discrete", "output")
-
-    @property
-    def last(self) -> int:
-        """One past the index of its last element."""
-        return self.first + self.variable.size
-
-
-def _rate(state: Variable) -> Variable:
-    unit = None if state.unit is None else rate_of(state.unit)
-    return Variable("der", shape=state.shape, unit=unit, description=f"Time derivative of {state.name}")
-
-
-def _settings(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
-    """Return the parameters of the FMU's own integrator."""
-    described = _STEP_DESCRIPTION + spec.step_note
-    step = Variable("v", "parameter", "tunable", description=described, start=spec.internal_step, unit="s", minimum=0.0)
-    integrator = Variable(
-        *("v", "parameter", "fixed"),
-        description=_INTEGRATOR_DESCRIPTION,
-        start=INTEGRATORS[spec.integrator],
-        unit="1",
-        minimum=1.0,
-        maximum=3.0,
-    )
-    tolerance = Variable(
-        *("v", "parameter", "tunable"),
-        description=_TOLERANCE_DESCRIPTION,
-        start=spec.tolerance,
-        unit="1",
-        minimum=1e-14,
-        maximum=0.1,
-    )
-    return [
-        ("tunable", step, "internal_step"),
-        ("fixed", integrator, "integrator"),
-        ("tunable", tolerance, "tolerance"),
-    ]
-
-
-def _indicators(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
-    about = "Event indicator"
-    return [
-        (
-            "indicator",
-            Variable("z", description=f"{about}: {e.description}" if e.description else about, nominal=e.nominal),
-            e.indicator,
-        )
-        for e in spec.events
-    ]
-
-
-def layout(spec: ModelSpec) -> tuple[Entry, ...]:
-    """Return all variables with value references and places among the values, in the order of ``model.h``."""
-    time = Variable("t", unit="s", description="Simulation time")
-    rows: list[tuple[Kind, Variable, str]] = [("time", time, "time")]
-    rows += [("tunable" if v.variability == "tunable" else "fixed", v, v.name) for v in spec.parameters]
-    rows += [("input", v, v.name) for v in spec.inputs]
-    rows += [("state", v, v.name) for v in spec.continuous]
-    rows += [("discrete", v, v.name) for v in spec.discrete]
-    rows += [("derivative", _rate(v), f"der({v.name})") for v in spec.continuous]
-    rows += [("output", v, v.name) for v in spec.outputs]
-    rows += _indicators(spec)
-    rows += _settings(spec)
-    entries = []
-    for reference, ((kind, variable, name), place) in enumerate(
-        zip(rows, lay_out(v.size for _, v, _ in rows), strict=True)
-    ):
-        of = reference - len(spec.states) if kind == "derivative" else None
-        entries.append(Entry(reference, kind, variable, name, place.start, of))
-    return tuple(entries)
 
 
 def expand_scalar(f: ca.Function) -> ca.Function:
@@ -237,7 +133,8 @@ def _number(value: float | None, missing: str) -> str:
     return missing if value is None else repr(float(value))
 
 
-def _table(entries: Iterable[Entry]) -> str:
+def variable_table(entries: Iterable[Entry]) -> str:
+    """Return the C table of variables, see ``runtime/model.h``."""
     rows = []
     for e in entries:
         low, high = _number(e.variable.minimum, "-INFINITY"), _number(e.variable.maximum, "INFINITY")
@@ -248,7 +145,8 @@ def _table(entries: Iterable[Entry]) -> str:
     return "static const lw_variable lw_variables[LW_N_VARIABLES] = {\n" + "\n".join(rows) + "\n};\n"
 
 
-def _starts(entries: Iterable[Entry]) -> str:
+def start_table(entries: Iterable[Entry]) -> str:
+    """Return the C table of start values."""
     values = [v for e in entries for v in (e.variable.flat_start or [0.0] * e.variable.size)]
     return c_array("double", "lw_start_values", map(repr, values))
 
@@ -311,8 +209,8 @@ def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
         '#include "model.h"\n',
         prepare_functions(written) + "/* The equations, written by CasADi. */\n" + written + restore_functions(),
         "#include <math.h>\n",
-        _table(entries),
-        _starts(entries),
+        variable_table(entries),
+        start_table(entries),
         *_tables(spec, equations.nonzeros),
         "".join(f'#include "{name}"\n' for name in RUNTIME[fmi][2:]),
     ]

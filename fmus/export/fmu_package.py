@@ -28,12 +28,16 @@ from ..toolchain import DIAGRAM_FLAGS, SUFFIXES, TARGETS, flags
 from .c_code import generate, runtime
 from .compiler import Compiler, check_platform, compile_shared, find_compiler
 from .html_page import index_html
-from .loop_fmu import describe_loop, generate_loop, loop_page, loop_runtime, scalarize_loop
+from .loop_description import describe_loop, loop_page
+from .loop_entries import scalarize_loop
+from .loop_fmu import generate_loop, loop_runtime
 from .loop_spec import LoopSpec, write_unit
+from .model_description import describe_model
 from .model_spec import ModelSpec
 from .scalars import scalarize
-from .xml_fmi2 import model_description2
-from .xml_fmi3 import build_description, model_description, package_version
+from .xml_fmi2 import write_description2
+from .xml_fmi3 import build_description, write_description3
+from .xml_text import package_version
 
 OTHER_FOLDER = "Name another folder."
 """Step where an FMU can't be written where its user wants it."""
@@ -92,16 +96,28 @@ def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
     written = [
         "c_code",
         "c_text",
+        "dependencies",
         "elementary_tables",
+        "entries",
         "html_page",
+        "model_description",
         "fmu_package",
         "quantities",
         "scalars",
         "xml_fmi2",
         "xml_fmi3",
+        "xml_text",
     ]
     if isinstance(spec, LoopSpec):
-        written += ["loop_fmu", "loop_memory", "loop_spec", "merged_plants", "own_sources"]
+        written += [
+            "loop_description",
+            "loop_entries",
+            "loop_fmu",
+            "loop_memory",
+            "loop_spec",
+            "merged_plants",
+            "own_sources",
+        ]
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
     unit = [write_unit(spec)] if isinstance(spec, LoopSpec) else []
     return [package_version(), *(text for _, text in sorted(_runtime_of(spec, fmi).items())), *modules, *unit]
@@ -161,13 +177,13 @@ def _archive(spec: ModelSpec | LoopSpec, options: Options, compiler: Compiler, n
     fmi = options.fmi
     included = _runtime_of(spec, fmi)
     if isinstance(spec, LoopSpec):
-        model, description = generate_loop(spec, _TOKEN, fmi), describe_loop(spec, _TOKEN, fmi)
+        model, about = generate_loop(spec, _TOKEN, fmi), describe_loop(spec, _TOKEN, fmi)
         page = loop_page(spec, options.documentation, fmi=fmi)
     else:
         model, derivatives = generate(spec, _TOKEN, fmi)
-        describe = model_description2 if fmi == 2 else model_description
-        description = describe(spec, _TOKEN, derivatives=derivatives)
+        about = describe_model(spec, _TOKEN, derivatives=derivatives, fmi=fmi)
         page = index_html(spec, options.documentation, fmi=fmi)
+    description = write_description2(about) if fmi == 2 else write_description3(about)
     token = _hash(description, model, *included.values())[:32]
     sources = {**included, "model.c": model.replace(_TOKEN, token)}
     files = {

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block
-from .c_code import Entry, layout
+from .entries import Entry, layout
 from .equation_text import equations, number
 from .model_spec import ModelSpec, Variable
 from .scalars import scalarize

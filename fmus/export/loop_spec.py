@@ -82,7 +82,7 @@ class Guards:
 
 
 @dataclass(frozen=True)
-class Slopes:
+class LoopSlopes:
     """Derivatives of a diagram: of some entries of the log, and of the rates of all continuous states behind these.
 
     ``forward``, ``reverse``: by kind of tick: of (t, x, w, p) and a seed, the product with the Jacobian by (t, x, w,
@@ -167,7 +167,7 @@ class LoopSpec:
     edges: tuple[tuple[float, float], ...] = ()
     periodic: tuple[tuple[float, float], ...] = ()
     depends: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    slopes: Slopes | None = None
+    slopes: LoopSlopes | None = None
     knowns: Mapping[tuple[str, int], frozenset[tuple[str, int]]] = field(default_factory=dict)
     clocked: tuple[str, ...] = ()
     offers_clocks: bool = False

@@ -39,7 +39,7 @@ from ..platform import record_build
 from .fmu_package import file_for, write_atomically, zip_files
 from .html_page import block_text
 from .model_spec import check_file_name
-from .xml_fmi3 import _unit, package_version
+from .xml_text import package_version, unit_element
 
 NEEDS = "Needs Python where it runs, with NumPy and Loopwright {version}: its equations are Python code."
 """Sentence at the end of such an FMU's description."""
@@ -384,7 +384,7 @@ def _complete(file: Path, about: dict[str, Any], values: dict[str, dict[str, Any
         for index in unknown:
             ET.SubElement(initial, "Unknown", {"index": index})
     if units:
-        definitions = ET.fromstring(f"<UnitDefinitions>{''.join(map(_unit, sorted(units)))}</UnitDefinitions>")
+        definitions = ET.fromstring(f"<UnitDefinitions>{''.join(map(unit_element, sorted(units)))}</UnitDefinitions>")
         root.insert(place + 1, definitions)
     ET.indent(root)
     files["modelDescription.xml"] = ET.tostring(root, encoding="utf-8", xml_declaration=True)

@@ -10,7 +10,7 @@ import numpy as np
 from .model_spec import ModelSpec, Variable
 
 
-def _elements(variable: Variable) -> Iterator[Variable]:
+def elements_of(variable: Variable) -> Iterator[Variable]:
     """Yield each element, row by row: ``s[1]``, ``s[2]``; ``m[1,2]``. FMI counts from 1 (FMI 2.0, 2.2.9)."""
     for index in np.ndindex(variable.shape):
         start = None if variable.start is None else float(np.asarray(variable.start)[index])
@@ -21,7 +21,7 @@ def _elements(variable: Variable) -> Iterator[Variable]:
 
 
 def _scalars(variables: Iterable[Variable]) -> tuple[Variable, ...]:
-    return tuple(e for v in variables for e in (_elements(v) if v.shape else (v,)))
+    return tuple(e for v in variables for e in (elements_of(v) if v.shape else (v,)))
 
 
 def scalarize(spec: ModelSpec) -> ModelSpec:
