@@ -56,7 +56,7 @@ from .delay_channels import blocks_around
 from .derivatives import LocalDerivatives, find_moving
 from .exchanged import derivations_at, findings_on
 from .flow_model import LinearDelays, Model, approximate_delays, model_continuous, relative_error
-from .free_motions import ClosedModel, FreeMotions, find_free_motions
+from .free_motions import FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .left_out_effects import EntryTaken
@@ -64,6 +64,7 @@ from .mean_stairs import A_TREATMENT
 from .operating_points import PointLike, check_options, operating_point, refine_ticks
 from .over_a_period import begin_loop, confirm_loop, model_at
 from .plant_models import A_WAY, EQUILIBRIUM
+from .shifted_diagram import ClosedModel
 from .signal_paths import SignalPaths
 from .taps import Tap, find_signal
 

@@ -342,7 +342,7 @@ def test_an_fmu_whose_states_can_not_be_shifted_is_judged_by_its_linear_model_an
     def refuse(block, **how):
         raise FmuError("its state has no exact start value")
 
-    monkeypatch.setattr("loopwright.diagrams.linearization.free_motions.take_shifted_steps", refuse)
+    monkeypatch.setattr("loopwright.diagrams.linearization.shifted_diagram.take_shifted_steps", refuse)
     (motion,) = fmu_drive().linearize(0.0).free_motions().motions
     assert motion.by_model_alone == ("motor",)
     assert str(motion) == (
