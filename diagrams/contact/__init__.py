@@ -5,8 +5,9 @@ from .confirmed_limits import ContactConfirmation, ContactTrial, TrialMethod, tr
 from .contact import SIDES, Contact, find_sign, make_contact
 from .contact_loop import close_loop, controller_rows, join_environment
 from .contact_ports import PortNames
-from .coupled_parts import restrict
+from .coupled_parts import ContactParts
 from .environment import check_properties, check_property
+from .held_signals import StateMatrices
 from .measured_force import Tool
 from .passivity import LOWEST, Passivity, PassivityReason, PortPassivity
 from .stability_limits import (
@@ -28,11 +29,13 @@ __all__ = [
     "ContactConfirmation",
     "ContactLimit",
     "ContactMap",
+    "ContactParts",
     "ContactTrial",
     "Passivity",
     "PassivityReason",
     "PortNames",
     "PortPassivity",
+    "StateMatrices",
     "Tool",
     "TrialMethod",
     "check_properties",
@@ -45,7 +48,6 @@ __all__ = [
     "find_sign",
     "join_environment",
     "make_contact",
-    "restrict",
     "scan_points",
     "to_rates",
     "try_limit",

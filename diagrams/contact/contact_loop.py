@@ -33,8 +33,9 @@ import numpy as np
 
 from ...blocks.core import Array, ParameterError, accepts
 from ..frequency import advance_held, hold_inputs
-from .coupled_parts import ContactParts, StateMatrices
+from .coupled_parts import ContactParts
 from .environment import VALUES
+from .held_signals import StateMatrices
 
 SLOW, SLOW_RATE = 1e-3, 1.0
 """Distance of |z| from 1, and rate in 1/s, within which a stable mode is looked at."""

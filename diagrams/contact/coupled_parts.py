@@ -13,9 +13,9 @@ from all signals of the plant to all its inputs.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,7 +33,6 @@ from ..linearization import (
     Linearization,
     PlantEquations,
     Tap,
-    TickModel,
     UnusualStart,
     find_signal,
     linearize,
@@ -43,6 +42,7 @@ from ..linearization import (
     wire_entries,
 )
 from .contact_ports import Ports, check_command, check_unit, force_wire_error
+from .held_signals import ControllerTick, StateMatrices, hold_signals
 from .measured_force import Tool, find_entry, find_tool
 
 if TYPE_CHECKING:
@@ -51,78 +51,10 @@ if TYPE_CHECKING:
     from ..wiring import Wire
 
 
-class StateMatrices(NamedTuple):
-    """State-space matrices; axes in front of the last two are those of a batch."""
-
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
-
-
-class ControllerTick(NamedTuple):
-    """Controller at one tick of a period, and the time in s to the next one."""
-
-    matrices: StateMatrices
-    duration: float
-
-
-def hold_signals(
-    models: Sequence[TickModel],
-    cut: Callable[[FourMatrices], StateMatrices],
-    shown: int,
-    felt_wire: int | None,
-    *,
-    inside: bool,
-) -> tuple[ControllerTick, ...]:
-    """Return the controllers of all ticks, with the signals that are held as states.
-
-    ``felt_wire`` is the number of the injected wire of the measured force, None if nothing renews or holds it by
-    itself. With ``inside`` the plant measures the force itself, and shows it at its communication points.
-    """
-    matrices = [cut(model.matrices) for model in models]
-    many, entries = len(matrices[0].C), matrices[0].B.shape[1]
-    renewed = []
-    for model in models:
-        felt = model.steps if inside else felt_wire is None or model.renews[felt_wire]
-        renewed.append(np.array([model.steps] * shown + [felt] * (entries - shown)))
-    held = [i for i in range(entries) if not all(r[i] for r in renewed)]
-    keeps = [not model.steps for model in models]
-    found = []
-    for model, K, r, keep in zip(models, matrices, renewed, keeps, strict=True):
-        found.append(ControllerTick(_hold(K, r, held, any(keeps), keep, many), model.duration))
-    return tuple(found)
-
-
-def _hold(
-    K: StateMatrices, renewed: np.ndarray, held: list[int], has_kept: bool, keep: bool, many: int
-) -> StateMatrices:
-    """Return a controller with further states: held inputs, and the plant's inputs where it doesn't take new ones."""
-    n, entries, kept = len(K.A), len(renewed), many if has_kept else 0
-    now = np.diag(renewed.astype(float))  # the inputs as the controller sees them: now h + last held
-    last = np.zeros((entries, len(held)))
-    last[held, range(len(held))] = ~renewed[held]
-    on_s = np.hstack([K.C, K.D @ last, np.zeros((many, kept))])
-    on_h = K.D @ now
-    if keep:
-        on_s, on_h = np.hstack([np.zeros((many, n + len(held))), np.eye(many)]), np.zeros((many, entries))
-    rows_s = [
-        np.hstack([K.A, K.B @ last, np.zeros((n, kept))]),
-        np.hstack([np.zeros((len(held), n)), last[held], np.zeros((len(held), kept))]),
-    ]
-    rows_h = [K.B @ now, now[held]]
-    if has_kept:
-        rows_s.append(on_s)
-        rows_h.append(on_h)
-    return StateMatrices(np.vstack(rows_s), np.vstack(rows_h), on_s, on_h)
-
-
 AT_REST = 1e-9
 """Largest change of a state in one second or over a sample, relative to 1 + its size, at a point that is at rest."""
 _ROUNDED = 1e-9
 """Relative size of an entry that should be zero."""
-_NOTHING = 1e-12
-"""Size of an entry, relative to others of its row and column, that is rounding."""
 _DOUBTFUL = 10.0
 """Factor by which a stated error of differences may be too small."""
 
@@ -322,77 +254,6 @@ def _cut_controller(
 def _is_of(path: str, state: str) -> bool:
     """Return whether a state is the plant's, or an output of it that is held."""
     return state.startswith((f"{path}.", f"held({path}."))
-
-
-def restrict(parts: ContactParts, axes: np.ndarray) -> ContactParts:
-    """Return the parts of a contact in one rate with forces and motions along some axes alone.
-
-    States and signals are left out that forces along these axes don't reach, or that don't move the contact along them.
-    """
-    P, K, many = parts.plant, parts.controller, len(parts.plant.C)
-    felt = many + axes
-    # signals in one row: states x, inputs u and outputs y of the plant, states k of the controller, forces f
-    sizes = {"x": len(P.A), "u": P.B.shape[1], "y": many, "k": len(K.A), "f": len(axes)}
-    ends = np.cumsum(list(sizes.values()))
-    place = {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends.tolist(), strict=True)}
-    leads = np.zeros((ends[-1], ends[-1]), dtype=bool)
-    for ways, M in {
-        "x from x": P.A,
-        "x from u": P.B,
-        "x from f": parts.force[:, axes],
-        "y from x": P.C,
-        "y from u": P.D,
-        "y from f": parts.force_shown[:, axes],
-        "k from k": K.A,
-        "k from y": K.B[:, :many],
-        "k from f": K.B[:, felt],
-        "u from k": K.C,
-        "u from y": K.D[:, :many],
-        "u from f": K.D[:, felt],
-        # the environment answers a motion by its force
-        "f from x": np.abs(parts.position[axes]) + np.abs(parts.velocity[axes]),
-    }.items():
-        leads[place[ways[0]], place[ways[-1]]] = _acts(M)
-    forces = np.arange(ends[-1]) >= place["f"].start
-    kept = _reach(leads, forces) & _reach(leads.T, forces)
-    x, u, y, k = (np.flatnonzero(kept[place[name]]) for name in "xuyk")
-    into = np.concatenate([y, felt])
-
-    def cut(M: StateMatrices) -> StateMatrices:
-        return StateMatrices(M.A[np.ix_(x, x)], M.B[np.ix_(x, u)], M.C[np.ix_(y, x)], M.D[np.ix_(y, u)])
-
-    errors, of_contact = parts.errors
-    return replace(
-        parts,
-        plant=cut(P),
-        force=parts.force[np.ix_(x, axes)],
-        force_shown=parts.force_shown[np.ix_(y, axes)],
-        position=parts.position[np.ix_(axes, x)],
-        velocity=parts.velocity[np.ix_(axes, x)],
-        controller=StateMatrices(K.A[np.ix_(k, k)], K.B[np.ix_(k, into)], K.C[np.ix_(u, k)], K.D[np.ix_(u, into)]),
-        errors=(
-            cut(errors),
-            StateMatrices(
-                of_contact.A[np.ix_(x, x)], of_contact.B[np.ix_(x, axes)], *(M[np.ix_(axes, x)] for M in of_contact[2:])
-            ),
-        ),
-        states=(tuple(parts.states[0][i] for i in x), tuple(parts.states[1][i] for i in k)),
-    )
-
-
-def _acts(M: np.ndarray) -> np.ndarray:
-    """Return which entries are more than rounding compared with the largest of their row or column."""
-    size = np.abs(M)
-    largest = np.maximum(size.max(axis=1, initial=0.0)[:, None], size.max(axis=0, initial=0.0))
-    return np.asarray(size > _NOTHING * largest)
-
-
-def _reach(leads: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return the entries that a start leads to, itself too; ``leads[i, j]`` is a way from j to i."""
-    found, before = start, np.zeros_like(start)
-    while (found != before).any():
-        found, before = found | leads[:, found].any(axis=1), found
-    return found
 
 
 def _linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> PlantEquations:

@@ -38,7 +38,8 @@ import numpy as np
 from ...blocks.core import Array, Finding, brief, explain_calls, on_one_thread
 from ..frequency import hold_inputs, refine_sign_change
 from .contact_loop import close_loop, controller_rows, join_environment
-from .coupled_parts import ContactParts, StateMatrices
+from .coupled_parts import ContactParts
+from .held_signals import StateMatrices
 
 ALIASES = 16
 """Aliases on each side that are summed one by one."""

@@ -62,13 +62,14 @@ from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Val
 from ...blocks.path_following import A_MODEL, A_PATH, planar_slopes
 from ...blocks.paths import Frame
 from ...blocks.tracing import check_method
-from ..contact import SIDES, Contact, PortNames, Tool, make_contact, restrict
+from ..contact import SIDES, Contact, PortNames, Tool, make_contact
 from ..diagram import Diagram
 from ..flat import WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import Wire
 from .fig3_parts import check_wires, delay_of, find_kinks, plant_path
 from .fig3_wires import Channel, Rig, wire
+from .restricted_contact import restrict
 from .robots_at_rest import PerfectRobot, RobotAtRest
 from .shown_plant import check_plant
 
