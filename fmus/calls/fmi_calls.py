@@ -12,6 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -212,12 +213,13 @@ class FmiCalls(ABC):
     def renew(self, log: Log, running: bool) -> None:
         """Free the instance, terminated if it is running, and make another one; its messages go to ``log``.
 
-        Calls that are bound to the old one can't be used any more.
+        Calls that are bound are then of the new one.
         """
         if running:
             self.terminate()
         getattr(self.fmu, f"{self.prefix}{self.freeing}")(self.fmu.component)
         self.instantiate(log)
+        self.instance_argument.value = self.fmu.component
 
     def terminate(self) -> None:
         """End the run of the instance."""
@@ -457,10 +459,12 @@ class FmiCalls(ABC):
         """
         return self.function(self.table.exchange[name])
 
-    @property
+    @cached_property
     def instance_argument(self) -> ctypes.c_void_p:
-        """The instance, as an argument of C functions."""
-        return ctypes.c_void_p(self.fmu.component)
+        """The present instance, as an argument of C functions: the same C value in all bound calls."""
+        made = self.variable(ctypes.c_void_p)
+        made.value = self.fmu.component
+        return made
 
     def update_events(self) -> EventUpdate:
         """Take a round of the event iteration, and return what it says (FMI 2.0, 3.2.2; FMI 3.0, 2.3.5)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from .native_step import NativeStep, RemoteStep
 from .saved_state import FmuState, SavedStates
 from .step import InstanceStep, StepMemory
 from .step_outcome import StepOutcome
-from .transfer import BoundStart
 
 
 class FmuInstance(LoadedFmu):
@@ -42,10 +42,7 @@ class FmuInstance(LoadedFmu):
         super().__init__(setup, wired)
         self.states, self._outcome = SavedStates(self), StepOutcome(self)
         self._step: InstanceStep | None = None
-        n, m = (sum(v.size for v in ports.values()) for ports in (self.inputs, setup.output_variables))
-        self._vectors = np.zeros(n), np.zeros(m)
         self.read = lambda t: None
-        self._starts: dict[tuple[str, ...], BoundStart | None] = {}
 
     @property
     def t(self) -> float:
@@ -58,12 +55,16 @@ class FmuInstance(LoadedFmu):
         self.read(self._began)
 
     def _bind(self, inputs: np.ndarray, outputs: np.ndarray) -> InstanceStep:
-        self._vectors = inputs, outputs
         self._step = step = InstanceStep(self, self.states, self._outcome, inputs, outputs)
         self.step, self.start_step, self.finish_step = step.function(), step.start, step.finish
         self.judge_native, self.finish_remote = step.judge_native, step.finish_native
         self.exchange, self.read = step.exchange, step.read
         return step
+
+    def _bind_own(self) -> InstanceStep:
+        """Bind vectors that nobody else has, for events without a run."""
+        sizes = [sum(v.size for v in ports.values()) for ports in (self.inputs, self.setup.output_variables)]
+        return self._bind(np.zeros(sizes[0]), np.zeros(sizes[1]))
 
     @property
     def native(self) -> NativeStep | None:
@@ -89,25 +90,23 @@ class FmuInstance(LoadedFmu):
 
     def begin(self) -> None:
         """Leave Initialization Mode and read the outputs at the start of the run."""
-        with self.host if self._start is None else nullcontext():
+        with self.host if self._starts.bound is None else nullcontext():
             super().begin()
             self._outcome.set_span(self._began, 0.0)
             if self.fmi.event_mode_used:  # it is in Event Mode now
-                (self._step or self._bind(*self._vectors)).begin(self._began)
+                (self._step or self._bind_own()).begin(self._began)
             self.read(self._began)
             if self.record.variables:
                 self.begin_texts(self._began)
 
     def reset(self) -> None:
-        """Return to the state before the initialization; steps are bound again to an instance that was made again."""
+        """Return to the state before the initialization; states of an instance that is made again are freed."""
         if not self.is_built_here:
             self.states.close()
         super().reset()
         self.states.final.value = not self.states.handles  # no earlier state is left to go back to
-        if self._step is not None and self.is_built_here:
+        if self._step is not None:
             self._step.forget()
-        elif self._step is not None:
-            self._bind(*self._vectors)
 
     def start_again(self, values: Mapping[str, np.ndarray]) -> None:
         """Reset it, set start values and enter Initialization Mode at t = 0, as `reset` and `initialize` do.
@@ -120,22 +119,19 @@ class FmuInstance(LoadedFmu):
             Start values besides those of the block, which they override, by the FMU's names.
         """
         self.reset()
-        given = {**self.setup.start, **values}
-        if (names := tuple(given)) not in self._starts:
-            fits = self.is_built_here and self.native is not None and BoundStart.fits(self.description, names)
-            self._starts[names] = BoundStart(self.fmi, self.description, names) if fits else None
-        start = self._starts[names]
-        if start is not None:
-            self._began, self._given = 0.0, given
+        self._began = 0.0
+        if self._starts_by_bound_calls:
             try:
-                entered = start.enter(given, self.setup.stepping.tolerance)
+                if self._starts.enter_bound({**self.setup.start, **values}):
+                    return
             except Exception as error:
                 raise self._initialization_error(error) from error
-            if entered:
-                self._start = start
-                return
             self.reset()
         self.initialize(None, values=values)
+
+    @cached_property
+    def _starts_by_bound_calls(self) -> bool:
+        return self.is_built_here and self.native is not None
 
     def begin_texts(self, t: float) -> None:
         """Let the record of texts continue from a time in s."""

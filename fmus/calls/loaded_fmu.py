@@ -29,20 +29,17 @@ from .fmu_setup import FmuSetup
 from .loading import load_calls
 from .message_log import MessageLog, clean_text, describe_end
 from .model_exchange_calls import order_questions
+from .start_values import StartValues
 from .step_options import choose_modes
 from .text_values import (
     Text,
     TextRecord,
-    is_readable,
     list_limits,
-    read_text,
-    waits_for_initialization,
     write_text,
 )
-from .transfer import BoundReading, BoundStart, OutOfRangeError, Transfer, UnfitError, is_kept
+from .transfer import BoundReading, OutOfRangeError, Transfer, UnfitError
 
 R = TypeVar("R")
-_SET = ("parameter", "input", "structuralParameter")
 _OPEN: WeakSet[LoadedFmu] = WeakSet()
 """Open instances of FMUs of which a process can have one only."""
 
@@ -78,8 +75,7 @@ class LoadedFmu:
         self.setup, self.description, self.model_exchange = setup, setup.description, model_exchange
         self.log = MessageLog(setup.label, list_limits(setup.label, self.description, model_exchange=model_exchange))
         self.is_open = self.is_running = False
-        self._start: BoundStart | None = None
-        self._began, self._given, self.is_built_here = 0.0, dict[str, Any](), is_built_here(self.description.digest)
+        self._began, self.is_built_here = 0.0, is_built_here(self.description.digest)
         self.host = HostState(self.add_note)
         self._load(setup.process_limits)
         self.is_open = True
@@ -87,6 +83,7 @@ class LoadedFmu:
             _OPEN.add(self)
         self.inputs = {port: setup.input_variables[port] for port in wired}
         self.record = TextRecord(self.fmi, setup.text_variables)
+        self._starts = StartValues(self.fmi, setup, self.set_values, self.read_variables)
 
     def _load(self, limits: Isolation | None) -> None:
         """Load its library, in a process with limits or in this one, and make the instance."""
@@ -204,66 +201,12 @@ class LoadedFmu:
             Further start values, by the FMU's names; they override the block's.
         """
         with self.host:
-            self._began, self._start = start_time, None
-            given = self._given = {**self.setup.start, **(values or {})}
+            self._began = start_time
             try:
-                self._configure(given)
-                tolerance, stop = self.setup.stepping.tolerance, self.setup.stepping.stop_time
-                stop_time = stop if stop_time is None else stop_time
-                self.fmi.set_up(start_time, stop_time, tolerance)
-                in_mode = {n: v for n, v in given.items() if waits_for_initialization(self.description, n)}
-                early = {n: v for n, v in given.items() if n not in (*self.description.structural, *in_mode)}
-                self.set_values(early)
-                self.fmi.enter_initialization_mode(start_time, stop_time, tolerance)
-                self.set_values(in_mode)
-                lost = self._find_lost(given)
-                if lost:  # some tools' FMUs drop parameters that are set before this mode
-                    self.set_values(lost)
-                    lost = self._find_lost(lost)
+                lost = self._starts.enter({**self.setup.start, **(values or {})}, start_time, stop_time)
             except Exception as error:
                 raise self._initialization_error(error) from error
-            self._refuse_lost(lost, "")
-
-    def _refuse_lost(self, lost: Mapping[str, Any], moment: str) -> None:
-        for name, value in lost.items():
-            text = self.description.texts.get(name)
-            kept = self.values([name]).tolist() if text is None else read_text(self.fmi, text)
-            put = value if text is not None else np.ravel(value).tolist()
-            advice = "Leave it out, or set the parameters that it depends on."
-            if name in (v.name for v in self.setup.input_variables.values()):
-                advice = "Wire it, with Constant, say: a wire sets it before each step."
-            raise FmuRuntimeError(
-                f"its start value was set to {put!r}, but is {kept!r}{moment}: the FMU does not keep it. {advice}",
-                block=self.setup.label,
-                port=f"start.{name}",
-                t=self._began,
-            )
-
-    def _configure(self, given: Mapping[str, Any]) -> None:
-        """Set the structural parameters, on which the sizes of arrays depend, in Configuration Mode."""
-        chosen = {name: value for name, value in given.items() if name in self.description.structural}
-        if chosen:
-            self.fmi.enter_configuration_mode()
-            self.set_values(chosen)
-            self.fmi.exit_configuration_mode()
-
-    def _find_lost(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return those of the given parameters and inputs that the FMU has not kept."""
-        about, lost, at, texts = self.description, {}, 0, self.description.texts
-        for name in (n for n in given if n in texts and is_readable(self.fmi, texts[n])):
-            if read_text(self.fmi, about.texts[name]) != given[name]:
-                lost[name] = given[name]
-        numbers = {n: v for n in given if n not in about.texts and (v := about.find(n)).causality in _SET}
-        numbers = dict(sorted(numbers.items(), key=lambda item: item[1].type))  # those of a type are read in one call
-        found = self.read_variables(numbers.values())
-        values = {name: np.ravel(given[name]).astype(float) for name in numbers}
-        if not values or np.array_equal(found, np.concatenate([*values.values()])):
-            return lost  # as nearly always
-        for name, v in numbers.items():
-            at += v.size
-            if not is_kept(found[at - v.size : at], values[name], single=v.type == "Float32"):
-                lost[name] = given[name]
-        return lost
+            self._starts.refuse(lost, start_time)
 
     def _initialization_error(self, error: Exception) -> FmuRuntimeError:
         if isinstance(error, FmuProcessError):
@@ -284,7 +227,6 @@ class LoadedFmu:
             self.call("resetting it", self.fmi.reset)
         else:
             self.call("making it again", self.fmi.renew, self.log.take, self.is_running and not self.failed)
-            self._reading = BoundReading(self.fmi)
         self.failed = self.is_running = self.ends_run = False
         self.refused = None
 
@@ -295,10 +237,7 @@ class LoadedFmu:
         except Exception as error:
             raise self._initialization_error(error) from error
         self.is_running = True
-        if self._start is None or not self._start.are_kept():
-            others = {*self.description.texts, *(v.name for v in self.setup.input_variables.values())}  # set again
-            names = [n for n in self._given if n not in others and self.description.find(n).causality != "input"]
-            self._refuse_lost(self._find_lost({n: self._given[n] for n in names}), " after its initialization")
+        self._starts.check_kept(self._began)
 
     # ---- calls that are not made at each step ----
 

@@ -118,6 +118,11 @@ class RemoteCalls(FmiCalls):
         if self.process.find(self.fmu.component) is not None:  # an address there that is shared memory here
             raise FmuError("its instance has an address that can't be told from shared memory; run it again.")
 
+    def renew(self, log: Log, running: bool) -> None:
+        """Free the instance and make another one, to which C in the child is bound, too; see `FmiCalls.renew`."""
+        super().renew(log, running)
+        self.process.bind_in_c_again()
+
     def allocate(self, n: int, ctype: type[Any]) -> np.ndarray:
         """Return an array (n,) of zeros of a C type in the shared memory."""
         return self.process.array(n, ctype)
@@ -164,9 +169,9 @@ class RemoteCalls(FmiCalls):
 
     def _follow(self, line: np.ndarray, references: Sequence[int], n: int) -> None:
         """Let the child set inputs from a line when the FMU asks for that; see `Fmi3Calls.slope_line`."""
-        place, component = self.process.find(line.ctypes.data), self.fmu.component
+        place, instance = (self.process.find(at) for at in (line.ctypes.data, ctypes.addressof(self.instance_argument)))
         seconds = self.limits.step_time
-        self.process.request("follow", place, list(references), n, component, call="fmi3SetFloat64", seconds=seconds)
+        self.process.request("follow", place, list(references), n, instance, call="fmi3SetFloat64", seconds=seconds)
 
     def read_printed(self) -> list[str]:
         """Return the last lines that the FMU has written to its standard output in this process's hold of it."""

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 
-from ...blocks.core import FmuRuntimeError, Layout
+from ...blocks.core import FmuRuntimeError
 from .bound_calls import BoundCalls, Call
 from .event_mode import EventMemory, EventMode
-from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING
+from .event_pile import EventPile
+from .fmi_calls import DISCARD, WARNING
+from .input_slopes import InputSlopes
 from .loaded_fmu import LoadedFmu
 from .native_step import NativeStep, QuietStep, RemoteStep, address_of, share, transfer_at
 from .saved_state import FmuState, SavedStates
@@ -29,12 +30,6 @@ from .transfer import Transfer, UnfitError, WatchedInputs
 
 _BY_PYTHON = StepParts.EVENTS | StepParts.EARLY_RETURN | StepParts.SLOPES | StepParts.ROLLBACK
 """Parts with which a loop in C takes those steps alone that turn out to be nothing but calls."""
-_PILED_PARTS, _PILE_SPAN = 500, 1e-8
-"""So many parts of a step within so many seconds (relative to 1 + |t|) are events that pile up."""
-_REFUSED_PARTS = 50_000
-"""Parts in one step, at the rate of the last ones, above which they are an error."""
-_SLOW_PARTS = 1000
-"""Parts in one step, at the rate of the last ones, above which the run warns of them."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +71,7 @@ class InstanceStep:
         self._exchange = fmi.bind([*self._all_inputs.calls, *self._outs.calls])
         self._is_read = False
         """Whether the calls of a step have read the outputs as they are at its end."""
-        self._has_warned = False
+        self._pile = EventPile(fmu, self.events)
         self._until = np.full(1, -math.inf if self.parts & _BY_PYTHON else math.inf)
         """Time in s before whose neighbourhood C takes steps."""
         self._taken = np.zeros(sum(part.index.size for part in self._watched))
@@ -221,18 +216,14 @@ class InstanceStep:
         if not self.parts & (StepParts.EVENTS | StepParts.EARLY_RETURN):
             self._judge_part(status, t, h)
             return
-        still, instants = 0, deque[float](maxlen=_PILED_PARTS)
+        self._pile.begin(t, h)
         while True:
             reached, asks = self._judge_part(status, now, part)
-            still = still + 1 if reached - now <= ROUNDED * h else 0
-            if still > MOST_ROUNDS:
-                self._refuse_standstill([*instants][-MOST_ROUNDS:], reached, still)
+            self._pile.note_end(now, reached)
             now = end if end - reached <= ROUNDED * h else reached
             if self._is_ended(t, h, now):
                 return
-            instants.append(now)
-            if len(instants) == _PILED_PARTS:
-                self._look_for_pile(instants)
+            self._pile.note_instant(now)
             if self.events is not None and self.events.act_within(now, end, h, asked=asks):
                 self._is_read = False
                 if self._is_ended(t, h, now):
@@ -396,40 +387,6 @@ class InstanceStep:
                     t=now,
                 )
 
-    def _refuse_standstill(self, latest: Sequence[float], reached: float, count: int) -> None:
-        """Refuse parts that return where they have begun, one after the other."""
-        if latest[-1] > latest[0]:
-            self._look_for_pile(latest, ends=True)
-        raise FmuRuntimeError(
-            f"its steps returned early at {reached:.9g} s {count} times in a row; expected that it continues. "
-            "Report it to its makers, or leave early_return out of stepping=.",
-            block=self.fmu.setup.label,
-            t=self._t,
-        )
-
-    def _look_for_pile(self, instants: Sequence[float], *, ends: bool = False) -> None:
-        """Warn of events that come so often that the step takes long; refuse those with which it would not end."""
-        now, each, h = instants[-1], (instants[-1] - instants[0]) / (len(instants) - 1), self._h
-        refused = ends or (h > _REFUSED_PARTS * each and instants[-1] - instants[0] < _PILE_SPAN * (1.0 + abs(now)))
-        if not refused and (h < _SLOW_PARTS * each or self._has_warned):
-            return
-        clocks, next_event = ([], math.inf) if self.events is None else (self.events.clocks, self.events.next_event)
-        ticking = [f"its clock {c.variable.name}" for c in clocks if c.next <= now + 2.0 * each]
-        own = "a time event" if next_event <= now + 2.0 * each else "an event within a step"
-        found = (
-            f"found events ({ticking[0] if ticking else own}) every {each:.2g} s, about {h / each:.2g} times in a step"
-        )
-        advice = "Look up in its documentation which input or parameter sets the time between its events"
-        if refused:
-            raise FmuRuntimeError(
-                f"{found} of {h:g} s, so the run would not advance; expected events that leave it its way. {advice}, "
-                "or report it to its makers.",
-                block=self.fmu.setup.label,
-                t=now,
-            )
-        self._has_warned = True
-        self.fmu.add_note(f"t = {now:.9g} s: {found} of {h:g} s; the run continues slowly. {advice}")
-
     # ---- the start, and saved states ----
 
     def begin(self, t: float) -> None:
@@ -534,42 +491,3 @@ class InstanceStep:
             quiet=quiet,
             is_careful=by_python,
         )
-
-
-class InputSlopes:
-    """Slopes of real inputs, by their differences from the step before (FMI 2.0, 4.2.1; FMI 3.0, 4.2.2).
-
-    ``last`` holds time in s and values of these inputs at the step before, NaN without one. ``line`` is there in FMI
-    3.0, where the FMU asks for its inputs within a step: start, status, values and slopes; before, a call sets the
-    slopes.
-    """
-
-    def __init__(self, fmu: LoadedFmu, ports: Sequence[str], u: np.ndarray):
-        fmi, is_new = fmu.fmi, fmu.description.fmi.startswith("3")
-        places = Layout.of({port: v.shape for port, v in fmu.inputs.items()}).slices
-        variables = {port: fmu.inputs[port] for port in ports}
-        with_slopes = {
-            port: v for port, v in variables.items() if v.type == "Float64" and (v.intermediate or not is_new)
-        }
-        self.places = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[places[port]] for port in with_slopes)])
-        self._u, n = u, self.places.size
-        references = [r for v in with_slopes.values() for r in v.references]
-        self.last = np.full(1 + n, math.nan)
-        self.line = fmi.slope_line(references, n) if n and is_new else None
-        self.slopes = fmi.allocate(n, ctypes.c_double) if self.line is None else self.line[2 + n :]
-        self.calls = [] if not n or self.line is not None else [fmi.slopes_call(references, self.slopes)]
-
-    def take(self, t: float) -> None:
-        """Take the slopes from the step before to the present inputs, at a time in s."""
-        now, last, n = self._u[self.places], self.last, self.places.size
-        self.slopes[:] = (now - last[1:]) / (t - last[0]) if t > last[0] else 0.0
-        if self.line is not None:
-            self.line[0], self.line[2 : 2 + n] = t, now
-        last[0], last[1:] = t, now
-
-    def take_status(self) -> int:
-        """Return the worst status of setting inputs within steps since it was asked for last."""
-        if self.line is None:
-            return 0
-        status, self.line[1] = int(self.line[1]), 0.0
-        return status

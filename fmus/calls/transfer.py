@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Layout
-from ..archive import FmuDescription, FmuVariable, inexact
+from ..archive import FmuVariable, inexact
 from .bound_calls import BoundCalls, Call
 from .fmi_calls import WARNING, FmiCalls
-from .text_values import waits_for_initialization
 
 _ROUNDED = 1e-12
 _MOST_LISTS = 50
@@ -252,51 +251,6 @@ class WatchedInputs:
         changed = self.differs
         self.values[:] = self.source[self.index]  # a zero may have got another sign
         return changed
-
-
-class BoundStart:
-    """Start values of type Float64, for which `fits` holds, set in one call, and read back in another."""
-
-    def __init__(self, fmi: FmiCalls, description: FmuDescription, names: tuple[str, ...]):
-        variables = {name: description.find(name) for name in names}
-        size = sum(v.size for v in variables.values())
-        self._fmi, self._given, self._found = fmi, np.zeros(size), np.zeros(size)
-        inputs = [np.full(v.size, v.causality == "input") for v in variables.values()]
-        self._inputs = np.concatenate([np.zeros(0, dtype=bool), *inputs])
-        self._set, self._get = (
-            Transfer(fmi, verb, variables, vector) for verb, vector in (("Set", self._given), ("Get", self._found))
-        )
-
-    @staticmethod
-    def fits(description: FmuDescription, names: tuple[str, ...]) -> bool:
-        """Whether start values can be set so: numbers of that type alone, which can be set before initialization."""
-        if any(name in description.texts or description.find(name).type != "Float64" for name in names):
-            return False
-        late = any(waits_for_initialization(description, name) for name in names)
-        return not late and not description.structural.keys() & set(names)
-
-    def enter(self, values: Mapping[str, Any], tolerance: float | None) -> bool:
-        """Set the values, enter Initialization Mode at t = 0; return whether the FMU has taken them to the last bit."""
-        np.concatenate([np.zeros(0), *(np.ravel(value) for value in values.values())], out=self._given)
-        self._fmi.set_up(0.0, None, tolerance)
-        if not self._call(self._set):
-            return False
-        self._fmi.enter_initialization_mode(0.0, None, tolerance)
-        return self.are_kept(inputs=True)
-
-    def are_kept(self, *, inputs: bool = False) -> bool:
-        """Whether the FMU has the values still, to the last bit; those of inputs count where that is asked for."""
-        if not self._call(self._get):
-            return False
-        same = self._found == self._given
-        return bool(same.all() if inputs else (same | self._inputs).all())
-
-    @staticmethod
-    def _call(transfer: Transfer) -> bool:
-        if transfer.plain_call is None:
-            return True
-        function, arguments = transfer.plain_call
-        return not function(*arguments)
 
 
 class BoundReading:

@@ -251,12 +251,19 @@ class Child:
                 self.server.take(self.bound)
         return self.server is not None, []
 
+    def do_bind_in_c_again(self, blobs: list[bytes]) -> tuple[None, list[bytes]]:
+        """Let C take the arguments of bound calls again: their instance is another one."""
+        if self.server is not None:
+            self.server.take(self.bound)
+        return None, []
+
     def do_follow(
-        self, place: int, references: list[int], n: int, component: int, blobs: list[bytes]
+        self, place: int, references: list[int], n: int, instance: int, blobs: list[bytes]
     ) -> tuple[None, list[bytes]]:
-        """Let inputs follow lines within a step, which the parent writes to the shared memory."""
+        """Let inputs follow lines within a step; the parent writes them and the instance to the shared memory."""
         numbers, values = (ctypes.c_double * (2 + 2 * n)).from_buffer(self.memory, place), (ctypes.c_double * n)()
-        self.line = numbers, (ctypes.c_uint * len(references))(*references), ctypes.c_void_p(component), values
+        component = ctypes.c_void_p.from_buffer(self.memory, instance)
+        self.line = numbers, (ctypes.c_uint * len(references))(*references), component, values
         return None, []
 
     def _update_inputs(self, environment: Any, t: float, can_set: bool, *others: Any) -> None:

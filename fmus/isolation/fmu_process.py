@@ -239,6 +239,11 @@ class ChildProcess:
             self._runs_in_c = True
             self.request("run_in_c", library, call="making its calls in C", seconds=_LOADING)
 
+    def bind_in_c_again(self) -> None:
+        """Let C in the child read the arguments of all bound calls again, which it has copied; see `run_in_c`."""
+        if self._runs_in_c:
+            self.request("bind_in_c_again", call="binding its calls", seconds=_LOADING)
+
     def give_up(self) -> None:
         """End the process after an interrupt in a call."""
         self.used = True

@@ -56,7 +56,7 @@ def test_start_values_are_set_in_one_call_and_a_run_of_others_is_a_single_run(di
     with Worker(make_plan(diagram.wired, 0.05, ("xi",), {"force": KEPT["force"]}, (), {})) as worker:
         for sample in samples(3):
             found = worker.run(sample)
-            assert worker._bound[None].engine.plants["plant"]._start is not None  # by the short way
+            assert worker._bound[None].engine.plants["plant"]._starts.bound is not None  # by the short way
             single = diagram.replace(sample.parameters).simulate(0.05, progress=False)
             assert found.signals["xi"].tobytes() == single["xi"].tobytes()
             assert found.numbers["force"].tobytes() == single["motor_force"].max(axis=0).tobytes()

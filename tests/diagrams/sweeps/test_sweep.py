@@ -509,7 +509,7 @@ def test_messages_of_runs_are_told_once(monkeypatch):
     begin = LoadedFmu.begin
 
     def warn(self):
-        self.add_note(f"stiffness {self._given['coulomb_scale']:g} is odd")
+        self.add_note(f"stiffness {self._starts.given['coulomb_scale']:g} is odd")
         begin(self)
 
     monkeypatch.setattr(LoadedFmu, "begin", warn)

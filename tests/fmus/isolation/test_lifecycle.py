@@ -314,3 +314,25 @@ def test_an_own_build_is_reset(msd, monkeypatch):
         assert calls == []
     finally:
         one.close()
+
+
+def test_an_instance_that_is_made_again_takes_no_more_memory(folder):
+    """Calls that were bound are then those of the new instance; binding them again would fill the shared memory."""
+    one = FmuInstance(setup_of(Fmu(zoo_fmu(folder, 3), name="plant", isolate=True)), [])
+    y = np.zeros(1)
+    one.bind(np.zeros(0), y)
+    taken = []
+    try:
+        for k in range(5):
+            one.initialize(None, values={"u": 1.0 + k})
+            one.begin()
+            for _ in range(3):  # bound when it is read for the second time
+                assert one.values(["y", "u"]).tolist() == [0.0, 1.0 + k]
+            one.step(0.0, 0.5)
+            assert one.values(["y"]) == y == 0.5 * (1.0 + k)
+            taken.append(one.fmi.process.place(0))
+            one.reset()
+    finally:
+        one.close()
+        end_idle()
+    assert len({*taken[1:]}) == 1  # the second start binds what the first one has read
