@@ -27,7 +27,7 @@ import numpy as np
 from loopwright.blocks import Gain, Sine, Sum, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import functions_between, write_code
-from loopwright.diagrams.simulation.compiled_ticks import kinds_of
+from loopwright.diagrams.flat import kinds_of
 
 SIZES = (10, 30, 100, 300, 1000, 3000, 10000)
 PRIVATE = {} if sys.platform == "win32" else {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS}

@@ -23,8 +23,6 @@ from ...fmus.export import (
 )
 from ..compiled import (
     CompiledHybrid,
-    CompiledLoop,
-    DiagramCode,
     NamedCode,
     function_text,
     functions_between,
@@ -38,12 +36,10 @@ from ..model_exchange import BlocksInModelExchange
 from ..simulation import (
     Continuous,
     Workspace,
-    accepts_of,
+    bind_hybrid,
+    bind_ticks,
     find_start_values,
     initialize,
-    is_stiff,
-    methods_of,
-    newton_options,
 )
 from ..solvers import METHODS, MethodKind
 from ..wiring import Wire, exact_time, join
@@ -99,7 +95,7 @@ def loop_spec(
         vectors |= {"edge": np.zeros(ROOM_FOR_EDGES), "late": np.zeros(ROOM_FOR_EDGES)}
         step = options.get("step_size", LoopSpec.step_size)
         continuous = _continuous(workspace, name, solver, rtol, atol, step)
-        bound = _bind_hybrid(workspace, continuous, acting, code)
+        bound = _bind_hybrid(continuous, acting, code)
         memory = read_memory({"hybrid": bound.structure}, vectors, bound.kept, code)
         facts["edges"], facts["periodic"] = find_edges(opened, continuous.sources)
         facts["events"] = tuple((opened.shown(e.path), e.name, e.subsystem) for e in flat.events)
@@ -107,7 +103,7 @@ def loop_spec(
         facts["left"] = None if left is None else CFunction.of(left)
         functions += [] if left is None else [left]
     else:
-        loop = _bind_ticks(workspace, write_code(flat, acting, whole=True).find(code))
+        loop = bind_ticks(workspace, write_code(flat, acting, whole=True).find(code))
         memory = read_memory({"loop": loop.structure}, vectors, loop.kept, code)
     plants, more = merge(opened, flat, flat.parameters.total)
     memory = _with_parameters(memory, here.p, more)
@@ -230,44 +226,11 @@ def _choose_solver(continuous: Continuous, step: float) -> str:
     return implicit if _STIFF < fastest * step < np.inf else explicit
 
 
-def _bind_ticks(workspace: Workspace, ticks: DiagramCode) -> CompiledLoop:
-    """Return the loop over ticks, bound to the numbers of a start, without plants."""
-    flat, here = workspace.flat, workspace.here
-    return CompiledLoop(
-        ticks,
-        [here.t, here.x, here.w, here.p],
-        [workspace.x_next, workspace.z, workspace.log, workspace.ok],
-        [],
-        columns=None,
-        width=0,
-        every=1,
-        stops=[],
-        loops={clocks: newton_options(flat, clocks, here.x) for clocks in ticks.loops},
-    )
-
-
-def _bind_hybrid(
-    workspace: Workspace, continuous: Continuous, acting: Sequence[frozenset[TickPattern]], code: NamedCode
-) -> CompiledHybrid:
+def _bind_hybrid(continuous: Continuous, acting: Sequence[frozenset[TickPattern]], code: NamedCode) -> CompiledHybrid:
     """Return the loop with continuous states, bound to the numbers of a start, without plants."""
-    flat, here = workspace.flat, workspace.here
-    between = functions_between(flat, stiff=is_stiff(continuous))
-    made = write_code(flat, acting, between, whole=True).find(code)
-    return CompiledHybrid(
-        made,
-        flat,
-        _bind_ticks(workspace, made),
-        [here.t, here.x, here.w, here.p],
-        workspace.x_next,
-        methods_of(continuous),
-        step=float(flat.base) if continuous.fixed else None,
-        domains=continuous.domains,
-        accepts=accepts_of(workspace, continuous, judged=made.judged),
-        loops=newton_options(flat, NONE, here.x) if flat.active_loops(NONE) else None,
-        tolerances=continuous.resolution,
-        drain=lambda: None,
-        logged=0,
-    )
+    between = functions_between(continuous.flat, stiff=continuous.is_stiff)
+    made = write_code(continuous.flat, acting, between, whole=True).find(code)
+    return bind_hybrid(continuous, made, bind_ticks(continuous.workspace, made), drain=lambda: None, logged=0)
 
 
 def _start(opened: OpenDiagram, flat: FlatDiagram) -> Workspace:

@@ -1,8 +1,7 @@
 """The loop over ticks, and between them."""
 
 from .algebraic_loops import newton_options
-from .compiled_hand_over import accepts_of, methods_of
-from .compiled_hybrid import is_stiff
+from .bound_loops import bind_hybrid, bind_ticks
 from .continuous import Continuous
 from .engine import Engine
 from .failed_blocks import START_SETTLED
@@ -37,17 +36,16 @@ __all__ = [
     "StartValues",
     "StopConditions",
     "Workspace",
-    "accepts_of",
     "apply_point",
+    "bind_hybrid",
+    "bind_ticks",
     "copy_states",
     "default_step",
     "find_initial_state",
     "find_late",
     "find_start_values",
     "initialize",
-    "is_stiff",
     "late_progress",
-    "methods_of",
     "newton_options",
     "next_instant",
     "note_held_inputs",

@@ -10,14 +10,22 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, FmuRuntimeError, OptionError, ParameterError, SimulationError
-from ..compiled import Domains, delays_of
+from ..compiled import Domains, MethodOptions, delays_of
 from ..flat import FlatDiagram, announcers, renumber
 from ..model_exchange import BlocksInModelExchange, OwnEvents
 from ..results import Occurrence
 from ..solvers import METHODS, Method, MethodKind, Problem
 from .failed_blocks import state_values
 from .initialize import domains_from_left
-from .solver_setup import absolute_tolerances, find_late, longest_step, scales_of, time_scale_of
+from .solver_setup import (
+    absolute_tolerances,
+    find_late,
+    has_guards,
+    longest_step,
+    remembers,
+    scales_of,
+    time_scale_of,
+)
 from .workspace import Workspace
 
 _AT_ONCE = 1e-6
@@ -86,6 +94,38 @@ class Continuous:
         """When indicators of FMUs have crossed zero last, in s."""
         self._fresh = self.save()
         self._changed: dict[str, Block] = {}  # blocks with other parameters than at the start, by path
+
+    # --- its method, as the loop in C is set up with it ---------------------------------------------------------------
+
+    @property
+    def methods(self) -> list[MethodOptions]:
+        """The methods in C that integrate a run: that of the solver's name, and one for where it is stiff."""
+        method, n = self.method, self.where.size
+        if not n:
+            return [MethodOptions("euler", 1.0, np.zeros(0), method.max_step)]
+        if method.fixed:
+            return [MethodOptions(method.name, 1.0, np.zeros(n), method.max_step)]
+        atol = np.broadcast_to(np.asarray(method.atol, dtype=float), (n,)).copy()
+        return [MethodOptions(name, method.rtol, atol, method.max_step) for name in method.names]
+
+    def describe_methods(self) -> str:
+        """Return in words which methods integrate the run, and where."""
+        facts = METHODS.get(self.method.name)
+        if facts is not None and facts.library is not None:
+            return f"{facts.library.value} takes steps of {facts.title}, and the rest of the run is C"
+        names = ", and where it is stiff ".join(f"{METHODS[m.name].title} ({m.name})" for m in self.methods)
+        return f"{names} runs in C as solver={self.method.name!r}"
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether the solver needs the derivative of the rates."""
+        return any(METHODS[method.name].uses_slope for method in self.methods)
+
+    def accepts(self, *, judged: bool, plants: bool = False, exchanged: bool = False) -> int:
+        """Return after which steps blocks are evaluated (`CompiledHybrid`); ``judged``: outputs may be non-finite."""
+        judged = judged and not self.fixed
+        always = plants or self.workspace.looped or remembers(self.flat) or has_guards(self.flat)
+        return 1 if always or (judged and not exchanged) else 2 if judged else 0
 
     def begin(self, *, at_start: bool) -> None:
         """Take the domains of the indicators where a run begins, at t = 0 from the left; elsewhere as they are."""

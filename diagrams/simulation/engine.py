@@ -14,23 +14,24 @@ import numpy as np
 
 from ...blocks.core import Block, CompilerError, SimulationError, UnknownNameError, near
 from ...fmus.calls import FmuInstance
-from ..compiled import DiagramCode, compile_code, find_obstacle, interpret_code
+from ..compiled import DiagramCode, find_obstacle
 from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_model_exchange, to_coupling
-from ..flat import FlatDiagram, kinds_of
+from ..flat import FlatDiagram
 from ..model_exchange import BlocksInModelExchange, ModelExchangeBlock
 from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
 from .change_over import ChangeOver
-from .compiled_hybrid import HybridTicks, find_code
-from .compiled_plants import PlantsInC
-from .compiled_ticks import CompiledTicks, bind_evaluations
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
 from .failed_blocks import opaque_failure
+from .hybrid_ticks import HybridTicks
 from .initialize import find_start_values, initialize
+from .plants_in_c import PlantsInC
 from .run_options import RunOptions
+from .sampled_ticks import SampledTicks
 from .start_at_point import check_past, start_at, take_over
 from .stops import StopConditions
+from .ticks_in_c import find_code, functions_of
 from .traced_start_values import choose_start_values
 from .view import Position, SimulationView
 from .workspace import Workspace
@@ -62,7 +63,7 @@ class Engine:
         self._passes_on = options.start_exchange
         self._compile, self._fuse = options.compiled, options.fuse
         self._changed = False  # whether generated code has taken over within the run
-        self._compiled: CompiledTicks | HybridTicks | None = None
+        self._compiled: SampledTicks | HybridTicks | None = None
         self._in_c: PlantsInC | None = None
         self._generated = False  # whether generated code is gone through, and no virtual machine
         self.messages: tuple[str, ...] = ()
@@ -137,18 +138,15 @@ class Engine:
         large, sampled = self.flat.by_block, self.continuous is None
         plain = sampled and large if self._fuse else sampled or large
         if (plain and self._compile is True) or large:
-            self.workspace.native = bind_evaluations(self.workspace, self._find_tick_code)
+            self.workspace.evaluate_in_c(self._find_tick_code)
         self._find_start(choose_start_values(self.workspace))
         if self._compile is True:
             self._make_compiled(machine=False)
 
     def _find_tick_code(self) -> DiagramCode:
         """Return the code of the ticks, for an evaluation of one."""
-        machine = self._compile is not True
-        if self.continuous is not None:
-            return find_code(self.flat, self.continuous, every=self.every_tick, machine=machine)
-        acting = kinds_of(self.flat, every=self.every_tick)
-        return interpret_code(self.flat, acting) if machine else compile_code(self.flat, acting)
+        functions = functions_of(self.flat, self.continuous, every=self.every_tick)
+        return find_code(self.flat, *functions, machine=self._compile is not True)
 
     def _find_start(self, set_start: Callable[[Workspace], None]) -> None:
         delays = None if self.continuous is None else self.continuous.delays
@@ -192,13 +190,13 @@ class Engine:
         plants, stops, continuous = self._plants_in_c(), self._stops.entries, self.continuous
         options = {"every": self.every_tick, "machine": machine, "fuse": self._fuse}
         obstacle = None if machine else find_obstacle(self.flat)
-        found: CompiledTicks | HybridTicks | None = None
+        found: SampledTicks | HybridTicks | None = None
         if obstacle is None:
             try:
                 if continuous is None:
-                    found = CompiledTicks(self.workspace, plants, stops, **options)
+                    found = SampledTicks(self.workspace, plants, stops, **options)
                 else:
-                    found = HybridTicks(self.workspace, continuous, plants, stops, **options)
+                    found = HybridTicks(continuous, plants, stops, **options)
             except CompilerError as error:
                 if machine:  # the library of the virtual machine can't be had
                     raise
@@ -216,7 +214,7 @@ class Engine:
             self._in_c = PlantsInC(self.flat, self.plants, self.steps, self.coupled)
         return self._in_c
 
-    def _ticks(self) -> CompiledTicks | HybridTicks:
+    def _ticks(self) -> SampledTicks | HybridTicks:
         """Return the loop in C, which goes from tick to tick."""
         if self._compiled is None:
             self._make_compiled(machine=True)

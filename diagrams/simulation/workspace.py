@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, ParameterError
+from ...blocks.core import Block, LoopwrightError, ParameterError
 from ...blocks.tracing import is_traced_by
+from ..compiled import DiagramCode, bind_call
 from ..flat import (
     NONE,
     Bound,
@@ -47,7 +48,7 @@ class Workspace:
         self.looped = bool(flat.loops.slices)
         self._evaluations: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._kept: list[Bound] = []
-        self.native: Mapping[frozenset[TickPattern], Callable[[], None]] = {}
+        self._native: Mapping[frozenset[TickPattern], Callable[[], None]] = {}
         """Evaluations of ticks at ``here`` that need no traced function of the whole diagram, by the acting clocks."""
         self.begun = False  # whether the start is found: from then on loops must determine their values
         self.messages: tuple[str, ...] = ()
@@ -103,11 +104,26 @@ class Workspace:
     def _evaluation(self, acting: frozenset[TickPattern]) -> Callable[[], None]:
         if acting not in self._evaluations:
             results = [self.x_next, self.z, self.log, self.ok]
-            native = self.native.get(acting)
+            native = self._native.get(acting)
             call = self._bind(self.flat.at_tick(acting), self.here, results).call if native is None else native
             solve = self.loop_solver(acting, self.here)
             self._evaluations[acting] = call if solve is None else _one_after_the_other(solve, call)
         return self._evaluations[acting]
+
+    def evaluate_in_c(self, find_code: Callable[[], DiagramCode]) -> None:
+        """Evaluate ticks in C, with the bits of interpreted ones, where their code can be had."""
+        # The functions of a large diagram take seconds to trace as a whole, and calls of its blocks need none of them.
+        flat, here = self.flat, self.here
+        if flat.loops.slices or flat.in_model_exchange:
+            return
+        try:
+            code = find_code()
+        except LoopwrightError:  # the start is then evaluated by Python; `Engine` reports the obstacle
+            return
+        results = [self.x_next, self.z, self.log, self.ok]
+        vectors = [here.t, here.x, here.w, here.p]
+        if code.exact:
+            self._native = {clocks: bind_call(tick, vectors, results) for clocks, tick in code.ticks.items()}
 
     def evaluate_with_held(self) -> None:
         """Evaluate the outputs at ``here`` into log, between ticks of a diagram without continuous states."""

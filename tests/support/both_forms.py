@@ -2,8 +2,8 @@
 
 import pytest
 
-from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
-from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
+from loopwright.diagrams.simulation.sampled_ticks import SampledTicks
+from loopwright.diagrams.simulation.ticks_in_c import TicksInC
 
 
 def refuse_ticks_by_python(patch):
@@ -12,8 +12,8 @@ def refuse_ticks_by_python(patch):
     def refused(*_, **__):
         raise AssertionError("Python had to look at a tick")
 
-    patch.setattr(CompiledTicks, "_take_tick", refused)
-    patch.setattr(HybridTicks, "_take_rare_tick", refused)
+    patch.setattr(SampledTicks, "_take_tick", refused)
+    patch.setattr(TicksInC, "_take_rare_tick", refused)
 
 
 def both(made, duration, **options):

@@ -8,8 +8,8 @@ import numpy as np
 from loopwright.blocks import LoopwrightError
 from loopwright.diagrams import diagram as facade
 from loopwright.diagrams.simulation import simulation
-from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
-from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
+from loopwright.diagrams.simulation.hybrid_ticks import HybridTicks
+from loopwright.diagrams.simulation.sampled_ticks import SampledTicks
 
 FACTOR = 100.0
 """Times the tolerances that values of both forms may differ by."""
@@ -50,7 +50,7 @@ def install(patch):
             counts["compiled"] += 1
         return first
 
-    watch(CompiledTicks)
+    watch(SampledTicks)
     watch(HybridTicks)
     patch.setattr(facade, "simulate", simulate)
 

@@ -20,7 +20,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, Run, subsystem
 from loopwright.diagrams.compiled import background, compiled_libraries, expanded_functions, runtime
-from loopwright.diagrams.simulation import RunOptions, change_over, compiled_ticks
+from loopwright.diagrams.simulation import RunOptions, change_over, sampled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
 
@@ -48,13 +48,13 @@ def eager(monkeypatch):
     monkeypatch.setattr(background, "_LEAST", -1.0)
     monkeypatch.setattr(background, "Thread", AtOnce)
     monkeypatch.setattr(change_over, "_REPORTED", [])
-    begun, hand_over = [], compiled_ticks.CompiledTicks.hand_over
+    begun, hand_over = [], sampled_ticks.SampledTicks.hand_over
 
     def watched(self, code):
         begun.append(True)
         return hand_over(self, code)
 
-    monkeypatch.setattr(compiled_ticks.CompiledTicks, "hand_over", watched)
+    monkeypatch.setattr(sampled_ticks.SampledTicks, "hand_over", watched)
     return begun
 
 

@@ -8,7 +8,7 @@ from loopwright.diagrams import experiments
 from loopwright.diagrams.compiled import write_code
 from loopwright.diagrams.compiled.generated_text import write_functions
 from loopwright.diagrams.compiled.reordered import put_in_order
-from loopwright.diagrams.simulation.compiled_ticks import kinds_of
+from loopwright.diagrams.flat import kinds_of
 
 ASKED = re.compile(r"arg\[\d+\]\?|if\s*\(res\[\d+\]!=0\)")
 

@@ -170,7 +170,7 @@ def test_a_run_goes_on_is_saved_and_branches_between_both_forms():
 
 def test_what_is_recorded_does_not_depend_on_chunks(monkeypatch):
     whole = compiled(oscillator(), 4.0, solver="RK45")
-    monkeypatch.setattr("loopwright.diagrams.simulation.compiled_hybrid.FIRST", 7)
+    monkeypatch.setattr("loopwright.diagrams.simulation.ticks_in_c.FIRST", 7)
     parts = compiled(oscillator(), 4.0, solver="RK45")
     assert whole.data.tobytes() == parts.data.tobytes()
     every = compiled(oscillator(), 4.0, solver="RK45", every=7)

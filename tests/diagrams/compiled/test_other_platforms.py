@@ -8,8 +8,8 @@ import pytest
 from loopwright.blocks import Constant, Gain, Integrator, Product, PythonFunction, Relay, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.compiled import compiled_libraries, functions_between, fused, write_code
+from loopwright.diagrams.flat import kinds_of
 from loopwright.diagrams.lanes import lane_code
-from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 from loopwright.fmus.export.compiler import TARGETS
 from loopwright.fmus.platform import native_platform
 from loopwright.fmus.runtime import runtime_source

@@ -26,7 +26,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Coupling, Diagram, Interrupted, subsystem
 from loopwright.diagrams.flat import kinds_of
-from loopwright.diagrams.simulation import compiled_hand_over, compiled_hybrid, compiled_ticks
+from loopwright.diagrams.simulation import bound_loops, ticks_in_c
 from loopwright.diagrams.simulation.algebraic_loops import newton_options
 from loopwright.fmus import Fmu, FmuProcessError, FmuRuntimeError, StepOptions, build_fmu
 from support.both_forms import assert_same_bits, both
@@ -311,7 +311,7 @@ def test_a_run_goes_on_behind_ticks_that_python_has_evaluated(folder, monkeypatc
     def none(*arguments):
         return replace(newton_options(*arguments), iterations=0, tolerance=-1.0)
 
-    monkeypatch.setattr(compiled_hand_over, "newton_options", none)
+    monkeypatch.setattr(bound_loops, "newton_options", none)
 
     @subsystem(sample_time=MS)
     def box(t):
@@ -337,8 +337,7 @@ def test_a_run_goes_on_behind_ticks_that_python_has_evaluated(folder, monkeypatc
 @pytest.mark.drawn(1)
 def test_rare_sets_of_clocks_are_python_s_and_the_steps_go_on(folder, monkeypatch, solved):
     """There is no code for the ticks at which both boxes act."""
-    for module in (compiled_ticks, compiled_hybrid):
-        monkeypatch.setattr(module, "kinds_of", lambda *a, **o: [k for k in kinds_of(*a, **o) if len(k) < 2])
+    monkeypatch.setattr(ticks_in_c, "kinds_of", lambda *a, **o: [k for k in kinds_of(*a, **o) if len(k) < 2])
     t = Clock(name="clock")
     slow, other = zoo(zoo_fmu(folder, 3), "slow", 4 * MS), zoo(zoo_fmu(folder, 3), "other", 6 * MS)
     aside = [Integrator(name="aside")(t)] if solved else []

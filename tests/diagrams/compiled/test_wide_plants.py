@@ -5,7 +5,7 @@ import pytest
 
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.compiled import write_code
-from loopwright.diagrams.simulation.compiled_ticks import kinds_of
+from loopwright.diagrams.flat import kinds_of
 from loopwright.fmus import Fmu
 from support.small_fmus import small_fmu
 

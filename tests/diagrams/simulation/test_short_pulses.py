@@ -25,7 +25,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, check_block, subsystem
 from loopwright.diagrams.compiled import CompiledHybrid
-from loopwright.diagrams.simulation import compiled_hybrid
+from loopwright.diagrams.simulation import hybrid_ticks
 
 WIDTH = 1e-3
 
@@ -156,7 +156,7 @@ def test_instants_between_samples_are_asked_for_once(monkeypatch):
 
     monkeypatch.setattr(BandLimitedNoise, "next_instant", lambda self, t: (asked.append(t), found(self, t))[1])
     monkeypatch.setattr(CompiledHybrid, "limit_budget", limit_budget)
-    monkeypatch.setattr(compiled_hybrid, "perf_counter", lambda: float(len(asked)))  # 1 s for each question
+    monkeypatch.setattr(hybrid_ticks, "perf_counter", lambda: float(len(asked)))  # 1 s for each question
     T, count, held = 0.01, 6000, 6
     noise = BandLimitedNoise(sample_time=T, seed=3, variance=4.0, name="noise")
     lag = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="lag")

@@ -1,11 +1,10 @@
-"""From tick to tick in C with continuous states between them."""
+"""The ticks of a run with continuous states, which a method integrates between them in C."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -13,7 +12,6 @@ import numpy as np
 
 from ...blocks.core import SimulationError
 from ..compiled import (
-    BackgroundCode,
     CompiledHybrid,
     DiagramCode,
     HandedOver,
@@ -21,65 +19,45 @@ from ..compiled import (
     ReturnReason,
     Sign,
     Span,
-    code_sources,
-    compile_code,
-    functions_between,
-    interpret_code,
 )
-from ..flat import EVERY, NONE, ClockSets, FlatDiagram, TickPattern, kinds_of, ticks_after, times_of
+from ..flat import EVERY, NONE, TickPattern, ticks_after, times_of
 from ..results import Recorder
-from ..solvers import METHODS
+from .bound_loops import bind_hybrid
 from .broken_off import explain, explain_library, pile_up
-from .compiled_hand_over import (
-    EdgesAhead,
-    bind_hybrid,
-    describe_methods,
-    find_edges,
-    methods_of,
-)
-from .compiled_plants import PlantsInC
-from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED
 from .continuous import Continuous
 from .failed_blocks import forget_trials
-from .workspace import Workspace
+from .plants_in_c import PlantsInC
+from .source_edges import EdgesAhead, find_edges
+from .ticks_in_c import WISHED, TicksInC
 
 
-class HybridTicks:
-    """The ticks of a run with continuous states, gone through in C."""
+class HybridTicks(TicksInC[CompiledHybrid]):
+    """The ticks of a run with continuous states."""
 
     def __init__(
         self,
-        workspace: Workspace,
         continuous: Continuous,
         plants: PlantsInC,
-        stops: Sequence[int],  # entries of the log that end the run where they are true
+        stops: Sequence[int],
         *,
-        every: bool,  # visit every tick, not only those at which something acts
-        machine: bool = False,  # the virtual machine evaluates the functions, and no compiler is needed
-        fuse: bool = False,  # compile for the processor of this machine
+        every: bool,
+        machine: bool = False,
+        fuse: bool = False,
     ):
-        flat = self._flat = workspace.flat
-        self._workspace, self._continuous, self._plants = workspace, continuous, plants
-        self._stops = stops
-        self._is_fused = fuse
+        super().__init__(continuous.workspace, continuous, plants, stops, every=every, machine=machine, fuse=fuse)
+        flat, self._continuous, self._is_fused = continuous.flat, continuous, fuse
         plants.turn = self._turn
-        self._acting, self._stiff = kinds_of(flat, every=every), is_stiff(continuous)
-        self._code = find_code(flat, continuous, every=every, machine=machine, fuse=fuse)
         self._clocks = flat.visited if plants.entries else flat.distinct
         self._sampled = every or not self._clocks or EVERY in self._clocks
         lands = continuous.fixed or bool(plants.entries) or continuous.lands
         self._lands = lands or not self._sampled
-        self._loop: CompiledHybrid | None = None
-        self._recorder: Recorder | None = None
-        self._chunk = FIRST
         self._handed: HandedOver | None = None
 
     @property
-    def messages(self) -> tuple[str, ...]:
-        """How far results may differ from those of an interpreted run; empty where every bit is the same."""
+    def messages(self) -> tuple[str, ...]:  # noqa: D102 - as in the base
         continuous = self._continuous
         compiled = (
-            f"Compiled: {describe_methods(methods_of(continuous), continuous.method.name)}, by the same rules as "
+            f"Compiled: {continuous.describe_methods()}, by the same rules as "
             "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
         )
         fused = (
@@ -88,21 +66,14 @@ class HybridTicks:
         )
         return *((compiled,) if continuous.where.size else ()), *((fused,) if self._is_fused else ())
 
-    def hand_over(self, code: DiagramCode) -> None:
-        """Let generated code of the same functions continue; C must not run meanwhile."""
+    def hand_over(self, code: DiagramCode) -> None:  # noqa: D102 - as in the base
         self._code.hand_over(code)
         if self._loop is not None:
             self._loop.take_steps(code.steps)
 
-    def make_later(self) -> BackgroundCode:
-        """Return generated code of these functions that is made while they are interpreted."""
-        between = functions_between(self._flat, stiff=self._stiff)
-        write = partial(code_sources, self._flat, self._acting, between)
-        return BackgroundCode(self._flat, write, self._plants.prepare())
-
     # --- continuing ------------------------------------------------------------------------------------------------
 
-    def run(
+    def run(  # noqa: D102 - as in the base
         self,
         k: int,
         last: int,
@@ -111,7 +82,6 @@ class HybridTicks:
         arrived: Callable[..., bool],
         progress: Callable[[float], Any],
     ) -> float | None:
-        """Run as `CompiledTicks.run`; return the time in s at which a stop condition ended it between two ticks."""
         loop = self._bind(recorder)
         if k == 0:  # of a run before nothing is left
             loop.begin_again()
@@ -161,7 +131,7 @@ class HybridTicks:
                     return self._plants.ended
                 stays = True
             elif perf_counter() - started < WISHED and found.ticks == len(span.widths):
-                self._chunk = min(2 * self._chunk, LARGEST_CHUNK)
+                self._go_longer()
             progress(t)
         return None
 
@@ -287,37 +257,31 @@ class HybridTicks:
 
     # --- between Python and C ----------------------------------------------------------------------------------------
 
-    def prepare(self, recorder: Recorder) -> None:
-        """Bind the loop before its first tick."""
-        self._bind(recorder)
-
-    def _bind(self, recorder: Recorder) -> CompiledHybrid:
-        if self._loop is None or recorder is not self._recorder:
-            self._loop, self._handed = bind_hybrid(
-                self._code,
-                self._workspace,
-                self._continuous,
-                self._plants,
-                recorder,
-                self._stops,
-                methods_of(self._continuous),
-                rest=self._take_rare_tick,
-                drain=self._report,
+    def _bind_loop(self, recorder: Recorder) -> CompiledHybrid:
+        continuous, plants = self._continuous, self._plants
+        blocks, own = continuous.exchanged, continuous.own_events
+        # Blocks in model exchange and their own events come together, or neither is there.
+        self._handed = (
+            None
+            if blocks is None or own is None
+            else HandedOver(
+                self._flat,
+                blocks.blocks,
+                blocks.evaluators,
+                lambda event: continuous.report_own_event(*event),
+                own.count,
             )
-            self._recorder = recorder
-            self._kinds = ClockSets(self._flat.distinct, self._loop.kinds, len(self._loop.kinds))
-        return self._loop
-
-    def _take_rare_tick(self) -> int:
-        """Evaluate a tick for C at which clocks act together too seldom for generated code."""
-        assert self._loop is not None
-        acting = self._flat.acting(round(float(self._workspace.here.t[0]) / self._flat.base))
-        try:
-            self._workspace.evaluate(acting)
-        except SimulationError:  # raised where the loop breaks off
-            return 1
-        self._loop.note_taken(self._flat.taken_at(acting))
-        return 0
+        )
+        native = None if self._handed is None else self._handed.native
+        return bind_hybrid(
+            continuous,
+            self._code,
+            self._bind_ticks(recorder, native),
+            exchange=native,
+            plants=bool(plants.entries),
+            drain=self._report,
+            coupled=plants.are_coupled,
+        )
 
     @contextmanager
     def _turn(self, end: float) -> Iterator[None]:
@@ -333,7 +297,7 @@ class HybridTicks:
         loop.begin(t)
         if self._handed is not None:
             self._handed.hand_over()
-            loop.set_tolerances(methods_of(continuous))
+            loop.set_tolerances(continuous.methods)
         loop.plan([*method.planned.values()])
         loop.active = method.names.index(method.active) if continuous.where.size else 0
         if continuous.domains is not None:
@@ -359,18 +323,3 @@ class HybridTicks:
         for t, event in () if loop.watch is None else loop.watch.take_slid():
             assert continuous.domains is not None
             self._workspace.messages += continuous.domains.report_sliding(t, event)
-
-
-def find_code(
-    flat: FlatDiagram, continuous: Continuous, *, every: bool, machine: bool, fuse: bool = False
-) -> DiagramCode:
-    """Return the functions of a run for the virtual machine, or compiled; see `HybridTicks`."""
-    acting, between = kinds_of(flat, every=every), functions_between(flat, stiff=is_stiff(continuous))
-    if machine:
-        return interpret_code(flat, acting, between)
-    return compile_code(flat, acting, between, fuse=fuse)
-
-
-def is_stiff(continuous: Continuous) -> bool:
-    """Whether the solver needs the derivative of the rates."""
-    return any(METHODS[method.name].uses_slope for method in methods_of(continuous))
