@@ -35,6 +35,7 @@ from ..flat import NONE, FlatDiagram, TickPattern, bits_of, flatten, has_all_kin
 from ..model_exchange import BlocksInModelExchange
 from ..simulation import (
     Continuous,
+    RunOptions,
     Workspace,
     bind_hybrid,
     bind_ticks,
@@ -63,8 +64,8 @@ def loop_spec(
     name: str,
     description: str = "",
     solver: str = "auto",
-    rtol: float = 1e-6,
-    atol: float = 1e-8,
+    rtol: float = RunOptions.rtol,
+    atol: float = RunOptions.atol,
     between: bool = True,
     differentiated: bool = False,
     **options: Any,

@@ -18,6 +18,7 @@ from loopwright.blocks import (
     ParameterError,
     Power,
     Sine,
+    StateSpace,
     Step,
     Sum,
     TransferFunction,
@@ -266,6 +267,24 @@ def test_a_diagram_without_names_puts_out_what_nothing_reads(tmp_path):
     assert item["thrice.y"] == 0.0
     item.step(0.0, 1.0)
     assert item["thrice.y"] == pytest.approx(3.0 * (1.0 - np.exp(-0.5)), rel=1e-7)
+    item.free()
+
+
+def test_states_between_ticks_have_the_bits_of_the_run(tmp_path):
+    """Steps of variable length have the tolerances of a run without more, the absolute one, too."""
+    plant = StateSpace(A=[[-600.0, -25.0], [2500.0, -0.5]], B=[500.0, 0.0], C=[0.0, 1.0], name="plant")
+
+    @subsystem(sample_time=0.01)
+    def law(y):
+        return PID(kp=0.05, ki=2.0)(Step(times=0.02, values=300.0, name="wish"), y)
+
+    diagram = Diagram("loop", plant(law(plant.y)).named("y"))
+    run = diagram.simulate(0.2, progress=False)
+    item = open_instance(build(diagram), tmp_path).initialize()
+    for k in range(20):
+        item.step(float(run.t[k]), 0.01)
+        assert item["y"] == run["y"][k + 1]
+    assert item["y"] > 200.0
     item.free()
 
 
