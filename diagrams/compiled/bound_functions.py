@@ -23,6 +23,11 @@ TICK = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
 """Kind of the function of a tick."""
 
 
+def fields_of(kind: Any, names: str) -> list[tuple[str, Any]]:
+    """Return fields of one kind of a struct."""
+    return [(name, kind) for name in names.split()]
+
+
 class TickStructure(ctypes.Structure):
     """A function with its vectors, as C knows it."""
 

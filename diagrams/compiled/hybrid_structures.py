@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-from typing import Any
 
-from .bound_functions import TickStructure
+from .bound_functions import TickStructure, fields_of
 from .compiled_loop import LoopStructure
 from .watch import WatchStructure
-
-
-def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
-    return [(name, kind) for name in names.split()]
-
 
 _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
@@ -21,16 +15,16 @@ class ProblemStructure(ctypes.Structure):
     """A differential equation, as C knows it."""
 
     _fields_ = [
-        *_fields(_INT, "n width"),
+        *fields_of(_INT, "n width"),
         ("where", _AT),
         ("flow", TickStructure),
         ("slope", TickStructure),
-        *_fields(_AT, "t x slopes"),
+        *fields_of(_AT, "t x slopes"),
         ("entries", _INT),
-        *_fields(_AT, "row column"),
-        *_fields(_REAL, "stop edge left at late"),
-        *_fields(_AT, "loops here by_loops delays"),
-        *_fields(_INT, "rates jacobians lost noting"),
+        *fields_of(_AT, "row column"),
+        *fields_of(_REAL, "stop edge left at late"),
+        *fields_of(_AT, "loops here by_loops delays"),
+        *fields_of(_INT, "rates jacobians lost noting"),
         ("beyond_t", _REAL),
         ("beyond", _AT),
     ]
@@ -40,15 +34,15 @@ class DelaysStructure(ctypes.Structure):
     """Transport delays, as C knows them."""
 
     _fields_ = [
-        *_fields(_INT, "n distinct"),
-        *_fields(_AT, "tau different input output size start node weight"),
-        *_fields(_INT, "inputs outputs"),
-        *_fields(_AT, "here trial"),
+        *fields_of(_INT, "n distinct"),
+        *fields_of(_AT, "tau different input output size start node weight"),
+        *fields_of(_INT, "inputs outputs"),
+        *fields_of(_AT, "here trial"),
         ("driven", TickStructure),
-        *_fields(_AT, "z found"),
-        *_fields(_REAL, "rtol atol"),
-        *_fields(_AT, "pieces edges"),
-        *_fields(_INT, "count capacity noted room smoothed"),
+        *fields_of(_AT, "z found"),
+        *fields_of(_REAL, "rtol atol"),
+        *fields_of(_AT, "pieces edges"),
+        *fields_of(_INT, "count capacity noted room smoothed"),
         ("middle", _REAL),
     ]
 
@@ -57,18 +51,18 @@ class MethodStructure(ctypes.Structure):
     """A method of integration, as C knows it."""
 
     _fields_ = [
-        *_fields(_INT, "kind n stages order extra"),
-        *_fields(_AT, "A B C E E3 P A_extra C_extra atol"),
-        *_fields(_REAL, "rtol longest exponent"),
+        *fields_of(_INT, "kind n stages order extra"),
+        *fields_of(_AT, "A B C E E3 P A_extra C_extra atol"),
+        *fields_of(_REAL, "rtol longest exponent"),
         ("of", _AT),
-        *_fields(_REAL, "planned t t_old h start"),
-        *_fields(_INT, "count done steps rejected segment"),
+        *fields_of(_REAL, "planned t t_old h start"),
+        *fields_of(_INT, "count done steps rejected segment"),
         ("mark", _REAL),
-        *_fields(ctypes.c_int32, "sliver prepared"),
-        *_fields(_AT, "x x_old f y g K D J lu lu_complex Z W F error scale pivots pivots_complex"),
-        *_fields(_REAL, "h_of_lu h_before error_before tolerance"),
-        *_fields(ctypes.c_int32, "has_lu has_slope slope_is_new predicts"),
-        *_fields(_AT, "step library"),
+        *fields_of(ctypes.c_int32, "sliver prepared"),
+        *fields_of(_AT, "x x_old f y g K D J lu lu_complex Z W F error scale pivots pivots_complex"),
+        *fields_of(_REAL, "h_of_lu h_before error_before tolerance"),
+        *fields_of(ctypes.c_int32, "has_lu has_slope slope_is_new predicts"),
+        *fields_of(_AT, "step library"),
         ("begins", ctypes.c_int32),
     ]
 
@@ -81,17 +75,17 @@ class HybridStructure(ctypes.Structure):
         ("p", ProblemStructure),
         ("w", WatchStructure),
         ("methods", _AT * 2),
-        *_fields(_INT, "active automatic accepts between budget inside begun stepped"),
-        *_fields(_REAL, "t to counts_as"),
-        *_fields(_INT, "found hits misses easy outputs"),
-        *_fields(_AT, "taken taken_first taken_states before"),
+        *fields_of(_INT, "active automatic accepts between budget inside begun stepped"),
+        *fields_of(_REAL, "t to counts_as"),
+        *fields_of(_INT, "found hits misses easy outputs"),
+        *fields_of(_AT, "taken taken_first taken_states before"),
         ("switched", _INT),
         ("solved", _AT),
         ("looked_at", _REAL),
         ("o", _AT),
         ("jump", _REAL),
         ("drain", _AT),
-        *_fields(_INT, "coupled lost_at"),
+        *fields_of(_INT, "coupled lost_at"),
         ("looked", _REAL),
     ]
 
@@ -101,9 +95,9 @@ class SpanStructure(ctypes.Structure):
 
     _fields_ = [
         ("count", _INT),
-        *_fields(_AT, "times widths kinds lands"),
+        *fields_of(_AT, "times widths kinds lands"),
         ("beyond", _REAL),
         ("edges", _INT),
-        *_fields(_AT, "edge late"),
-        *_fields(_INT, "room stays"),
+        *fields_of(_AT, "edge late"),
+        *fields_of(_INT, "room stays"),
     ]

@@ -15,7 +15,7 @@ from ...fmus.calls import BoundCalls, ModelExchangeInstance, NativeAction, Nativ
 from ...fmus.host_state import HostState
 from ..flat import JUMP, OpaqueStage
 from ..model_exchange import OWN_EVENTS
-from .bound_functions import CALL, MemoryForC, TickStructure, at
+from .bound_functions import CALL, MemoryForC, TickStructure, at, fields_of
 from .plants_called_back import LateReplies, RemotePlants
 
 _LOGGED = 2**20  # bytes of events in a call
@@ -23,18 +23,14 @@ _TO_STEP, _FAILED_IN_PYTHON = 0, 2
 _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
-def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
-    return [(name, kind) for name in names.split()]
-
-
 class _Action(ctypes.Structure):
     _fields_ = [
-        *_fields(_INT, "kind count"),
+        *fields_of(_INT, "kind count"),
         ("function", _AT),
         ("arguments", ctypes.c_uint64 * 8),
-        *_fields(_AT, "vector index buffer"),
+        *fields_of(_AT, "vector index buffer"),
         ("type", _INT),
-        *_fields(_REAL, "low high"),
+        *fields_of(_REAL, "low high"),
         ("warned_at", _AT),
     ]
 
@@ -46,16 +42,16 @@ class _ActionsInC(ctypes.Structure):
 class _Exchanged(ctypes.Structure):
     _fields_ = [
         ("of", _AT),
-        *_fields(_INT, "place states inputs events first"),
-        *_fields(_ActionsInC, "complete enter update leave"),
-        *_fields(_AT, "again terminate nominals defined wants ends time"),
-        *_fields(_INT, "width again_where"),
-        *_fields(_AT, "u least relative low high discrete"),
+        *fields_of(_INT, "place states inputs events first"),
+        *fields_of(_ActionsInC, "complete enter update leave"),
+        *fields_of(_AT, "again terminate nominals defined wants ends time"),
+        *fields_of(_INT, "width again_where"),
+        *fields_of(_AT, "u least relative low high discrete"),
         ("next_time", _REAL),
-        *_fields(_INT, "asks ended in_event"),
+        *fields_of(_INT, "asks ended in_event"),
         ("end", _REAL),
-        *_fields(_INT, "other_nominals acted event by_python"),
-        *_fields(_AT, "changed far"),
+        *fields_of(_INT, "other_nominals acted event by_python"),
+        *fields_of(_AT, "changed far"),
     ]
 
 
@@ -64,12 +60,12 @@ class _ModelExchange(ctypes.Structure):
         ("count", _INT),
         ("each", _AT),
         ("jump", TickStructure),
-        *_fields(_INT, "look lost failed plant"),
+        *fields_of(_INT, "look lost failed plant"),
         ("action", _AT),
-        *_fields(_INT, "call status"),
+        *fields_of(_INT, "call status"),
         ("at", _REAL),
         ("log", _AT),
-        *_fields(_INT, "logged capacity warned"),
+        *fields_of(_INT, "logged capacity warned"),
         ("apart", _AT),
         ("wait", ctypes.c_void_p),
     ]
@@ -84,7 +80,7 @@ class StageStructure(ctypes.Structure):
         ("looks", _INT),
         ("calls", _ActionsInC),
         ("by_python", _AT),
-        *_fields(_AT, "t x u into"),
+        *fields_of(_AT, "t x u into"),
         ("made", _INT),
     ]
 

@@ -10,17 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..flat import FlatDiagram
-from .bound_functions import FunctionInC, MemoryForC, TickStructure
+from .bound_functions import FunctionInC, MemoryForC, TickStructure, fields_of
 from .event_domains import Domains
 from .staged import NativeModelExchange
 
 _LOGGED = 2**22  # bytes of what has fired in a call
 _INSTANTS = 1100  # of a step that are looked at together, at most
 _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-
-
-def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
-    return [(name, kind) for name in names.split()]
 
 
 class WatchStructure(ctypes.Structure):
@@ -30,18 +26,18 @@ class WatchStructure(ctypes.Structure):
         ("m", _INT),
         ("indicators", TickStructure),
         ("jump", TickStructure),
-        *_fields(_AT, "z open fired rising falling hysteretic hysteresis own own_first"),
-        *_fields(_REAL, "spacing finest step"),
-        *_fields(_AT, "domain low high slack size rounding largest counts latest fresh"),
-        *_fields(_AT, "side stuck briefs brief_at recent recent_fired"),
+        *fields_of(_AT, "z open fired rising falling hysteretic hysteresis own own_first"),
+        *fields_of(_REAL, "spacing finest step"),
+        *fields_of(_AT, "domain low high slack size rounding largest counts latest fresh"),
+        *fields_of(_AT, "side stuck briefs brief_at recent recent_fired"),
         ("fired_times", _INT),
         ("log", _AT),
-        *_fields(_INT, "logged capacity"),
-        *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following"),
-        *_fields(_AT, "gate inside inside_first start"),
-        *_fields(_INT, "sliding switched"),
+        *fields_of(_INT, "logged capacity"),
+        *fields_of(_AT, "times seen gates domains x x_before now strict values motion later fires following"),
+        *fields_of(_AT, "gate inside inside_first start"),
+        *fields_of(_INT, "sliding switched"),
         ("slid", _AT),
-        *_fields(_INT, "pile culprit piled"),
+        *fields_of(_INT, "pile culprit piled"),
     ]
 
 

@@ -14,7 +14,7 @@ from .flatten import flatten, renumber, write_numbers
 from .movable import Target, find_movable, with_movable
 from .plant_ticks import StepTable, own_step, takes_any_step
 from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram
-from .stages import Bound, Evaluators, OpaqueStage, Schedule, bind_function, evaluate_apart
+from .stages import Bound, Evaluator, Evaluators, OpaqueStage, Schedule, bind_function, evaluate_apart
 from .total_derivative import Derivative, size_of_motion
 from .trace_stages import trace_schedule
 from .vectors import Vectors, join_columns, loop_mismatch, next_x, plant_inputs, rates
@@ -37,6 +37,7 @@ __all__ = [
     "Bound",
     "ClockSets",
     "Derivative",
+    "Evaluator",
     "Evaluators",
     "FlatDiagram",
     "FlatEvent",

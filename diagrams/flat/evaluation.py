@@ -8,6 +8,7 @@ finds out who made a value that is not finite.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import casadi as ca
@@ -82,45 +83,60 @@ def evaluate(
     kept : column, optional
         Outputs at the last tick, as `FlatLayout.log` lays them out: those of blocks that do not act.
     """
-    instant = Instant(layout, functions, acting, t, x, w, p, fired, opened, taps or {}, apart, kept, begun)
+    instant = Instant(
+        layout,
+        functions,
+        acting,
+        t,
+        x,
+        w,
+        p,
+        fired=fired,
+        opened=opened,
+        begun=begun,
+        taps=taps or {},
+        apart=apart,
+        kept=kept,
+    )
     instant.run(layout.order.steps if order is None else order, before, visit)
     return instant
 
 
+@dataclass(eq=False)
 class Instant:
     """The values of all blocks at an instant, as flat columns; see `evaluate`."""
 
-    def __init__(
-        self,
-        layout: FlatLayout,
-        functions: BlockFunctions,
-        acting: frozenset[TickPattern],
-        t: Any,
-        x: Any,
-        w: Any,
-        p: Any,
-        fired: Any,
-        opened: bool,
-        taps: Mapping[tuple[str, str], Callable[[Any], Any]],
-        apart: Apart | None,
-        kept: Any = None,
-        begun: bool = False,
-    ):
-        self.begun = begun
-        self.layout, self.functions, self.acting = layout, functions, acting
-        self.t, self.x, self.w, self.p, self.fired = t, x, w, p, fired
-        self.opened, self.taps, self.apart, self.kept = opened, taps, apart, kept
-        self.values: dict[tuple[str, str], Any] = {}  # flat columns of all outputs, by port
-        self.returned: dict[tuple[str, str], Any] = {}  # outputs at tapped ports, as they were before the tap
-        self.new: dict[str, Any] = {}  # next states of the blocks that act, by path
-        self.rates: dict[str, Any] = {}  # by path
-        self.held: dict[str, Any] = {}  # outputs that are held from now on, by dotted port
-        self.gates: dict[str, Any] = {}  # of enabled and triggered subsystems: what they remember of their control
-        self.guards: list[Any] = []  # must be positive
-        self.mismatch: list[tuple[Any, Any]] = []  # of each torn port: what came round, and what was taken
-        self.provisional: set[str] = set()  # equations of the block at hand that are evaluated again, later
-        self._open: dict[str, Any] = {}
-        self._events = {(e.path, e.name): i for i, e in enumerate(layout.events)}
+    layout: FlatLayout
+    functions: BlockFunctions
+    acting: frozenset[TickPattern]
+    t: Any
+    x: Any
+    w: Any
+    p: Any
+    _: KW_ONLY
+    fired: Any = None
+    opened: bool = False
+    begun: bool = False
+    taps: Mapping[tuple[str, str], Callable[[Any], Any]] = field(default_factory=dict)
+    apart: Apart | None = None
+    kept: Any = None
+    values: dict[tuple[str, str], Any] = field(default_factory=dict, init=False)  # columns of all outputs, by port
+    # Outputs at tapped ports, as they were before the tap.
+    returned: dict[tuple[str, str], Any] = field(default_factory=dict, init=False)
+    new: dict[str, Any] = field(default_factory=dict, init=False)  # next states of the blocks that act, by path
+    rates: dict[str, Any] = field(default_factory=dict, init=False)  # by path
+    held: dict[str, Any] = field(default_factory=dict, init=False)  # outputs that are held from now on, by dotted port
+    # Of enabled and triggered subsystems: what they remember of their control.
+    gates: dict[str, Any] = field(default_factory=dict, init=False)
+    guards: list[Any] = field(default_factory=list, init=False)  # must be positive
+    # Of each torn port: what came round, and what was taken.
+    mismatch: list[tuple[Any, Any]] = field(default_factory=list, init=False)
+    # Equations of the block at hand that are evaluated again, later.
+    provisional: set[str] = field(default_factory=set, init=False)
+    _open: dict[str, Any] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        self._events = {(e.path, e.name): i for i, e in enumerate(self.layout.events)}
 
     def run(
         self,
@@ -290,7 +306,7 @@ class Instant:
             return True
         if subsystem in self._open:
             return self._open[subsystem]
-        _table, settings = self.layout.table, self.layout.table.subsystems[subsystem]
+        settings = self.layout.table.subsystems[subsystem]
         last = rows(self.x, self.layout.gates.slices[subsystem])
         if (subsystem, "enable") in self._events or not self._acts(subsystem):
             gate = is_true(last)  # blocks of another rate in it go by its last tick

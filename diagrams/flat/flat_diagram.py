@@ -26,6 +26,7 @@ from .flat_layout import FlatLayout, sample_time_of
 from .program import Cells, PartProgram, TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
+from .trace_stages import trace_schedule
 
 T = TypeVar("T")
 
@@ -175,12 +176,15 @@ class FlatDiagram(FlatLayout):
     @_shared
     def flow(self) -> Schedule:
         """Return the rates of the continuous states between ticks, ``(t, x, w, p) -> dx``."""
-        return flat_functions.trace_flow(self, self.blocks, self._rates.pop() if self._rates else None)
+        if self._rates:
+            symbols, dx = self._rates.pop()
+            return trace_schedule("flow", symbols, lambda apart: {"dx": dx})
+        return flat_functions.trace_between(self, self.blocks, "flow")
 
     @_shared
     def jacobian(self) -> Derivative:
         """Return the derivative of `flow` by the continuous states, ``(t, x, w, p) -> (n, n)``."""
-        return flat_functions.differentiate_flow(self, self.flow)
+        return Derivative(self.flow, [("x", self.continuous.tolist())], values=False)
 
     @_shared
     def jacobian_with_loops(self) -> Derivative:
@@ -190,17 +194,17 @@ class FlatDiagram(FlatLayout):
     @_shared
     def indicators(self) -> Schedule:
         """``(t, x, w, p) -> (g, open)``: indicators of `events`, and whether the subsystems around them are enabled."""
-        return flat_functions.trace_indicators(self, self.blocks)
+        return flat_functions.trace_between(self, self.blocks, "indicators")
 
     @_shared
     def jump(self) -> Schedule:
         """``(t, x, w, p, fired) -> x_next``: x after events."""
-        return flat_functions.trace_jump(self, self.blocks)
+        return flat_functions.trace_between(self, self.blocks, "jump")
 
     @_shared
     def driven(self) -> Schedule:
         """``(t, x, w, p) -> z`` between ticks: the inputs of transport delays, and of FMUs."""
-        return flat_functions.trace_driven(self, self.blocks)
+        return flat_functions.trace_between(self, self.blocks, "driven")
 
     @_shared
     def exchange(self) -> Schedule:

@@ -142,14 +142,47 @@ def trace_tick_program(layout: FlatLayout, functions: BlockFunctions, acting: fr
     )
 
 
-def trace_driven(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
-    """Return ``(t, x, w, p) -> z`` between ticks: the inputs of what is stepped between ticks."""
+def trace_between(layout: FlatLayout, functions: BlockFunctions, name: str) -> Schedule:
+    """Return a function between ticks; see `results_between`."""
     symbols = make_symbols(layout)
-    return trace_schedule(
-        "driven",
-        symbols,
-        lambda apart: {"z": plant_inputs(evaluate(layout, functions, NONE, **symbols, apart=apart))},
-    )
+    if name == "jump":
+        symbols["fired"] = ca.MX.sym("fired", len(layout.events))
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        instant = evaluate(layout, functions, NONE, **symbols, apart=apart)
+        return {result: join_columns(columns) for result, columns in results_between(name, instant).items()}
+
+    return trace_schedule(name, symbols, results)
+
+
+@without_collection
+def trace_part_program(layout: FlatLayout, functions: BlockFunctions, name: str) -> PartProgram:
+    """Return a function between ticks as a program; see `results_between`."""
+    sizes = (layout.width, layout.plant_outputs.total, layout.parameters.total)
+    program = Program(sizes, len(layout.events) if name == "jump" else 0)
+    fired = program.more if name == "jump" else None
+    instant = evaluate(layout, functions, NONE, program.t, program.x, program.w, program.p, fired=fired)
+    return PartProgram.of(program, *map(program.join, results_between(name, instant).values()))
+
+
+def results_between(name: str, instant: Instant) -> dict[str, list[Any]]:
+    """Return the results of a function between ticks, each by its name as columns one below the other.
+
+    ``"flow"`` has the rates dx of the entries of x that are integrated; ``"driven"`` z, the inputs of what is stepped
+    between ticks; ``"indicators"`` g, those of all events, and open, 1 where the subsystems around them are open;
+    ``"jump"`` x_next, the states after the events that fire, each of which sees the instant before them all. A block in
+    model exchange is asked at a jump whatever fires: it has its own events.
+    """
+    if name == "flow":
+        return {"dx": [rates(instant)]}
+    if name == "driven":
+        return {"z": [plant_inputs(instant)]}
+    if name == "indicators":
+        g, opened = indicators_of(instant)
+        return {"g": g, "open": opened}
+    assert name == "jump"
+    _let_fire(instant)
+    return {"x_next": [next_x(instant)]}
 
 
 def trace_model_exchange(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
@@ -173,30 +206,6 @@ def trace_output(layout: FlatLayout, functions: BlockFunctions, port: tuple[str,
     return trace_schedule("output", symbols, results)
 
 
-def trace_flow(layout: FlatLayout, functions: BlockFunctions, made: TracedRates | None = None) -> Schedule:
-    """Return ``(t, x, w, p) -> dx``: the rates of the entries of x that are integrated.
-
-    ``made`` are they, where a tick at which no clock acts has been traced, and no block has an evaluator.
-    """
-    if made is not None:
-        return trace_schedule("flow", made[0], lambda apart: {"dx": made[1]})
-    symbols = make_symbols(layout)
-    return trace_schedule(
-        "flow", symbols, lambda apart: {"dx": rates(evaluate(layout, functions, NONE, **symbols, apart=apart))}
-    )
-
-
-def trace_indicators(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
-    """Return ``(t, x, w, p) -> (g, open)``: indicators of all events, and 1 where the subsystems around are open."""
-    symbols = make_symbols(layout)
-
-    def results(apart: Apart) -> Mapping[str, Any]:
-        g, opened = indicators_of(evaluate(layout, functions, NONE, **symbols, apart=apart))
-        return {"g": ca.vertcat(*g), "open": ca.vertcat(*opened)}
-
-    return trace_schedule("indicators", symbols, results)
-
-
 def indicators_of(instant: Instant) -> tuple[list[Any], list[Any]]:
     """Return the indicators of all events at an instant, and 1 where the subsystems around them are open."""
     layout = instant.layout
@@ -217,22 +226,6 @@ def indicators_of(instant: Instant) -> tuple[list[Any], list[Any]]:
             gate = to_number(gate) if isinstance(instant.t, Cells) else ca.MX(float(gate))
         opened.append(gate)
     return g, opened
-
-
-def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
-    """Return ``(t, x, w, p, fired) -> x_next``: x after the events that fire; each sees the instant before them all.
-
-    A block in model exchange is asked whatever fires: it has its own events.
-    """
-    symbols = make_symbols(layout)
-    fired = ca.MX.sym("fired", len(layout.events))
-
-    def results(apart: Apart) -> Mapping[str, Any]:
-        instant = evaluate(layout, functions, NONE, **symbols, fired=fired, apart=apart)
-        _let_fire(instant)
-        return {"x_next": next_x(instant)}
-
-    return trace_schedule("jump", {**symbols, "fired": fired}, results)
 
 
 def _let_fire(instant: Instant) -> None:
@@ -264,22 +257,6 @@ def _let_fire(instant: Instant) -> None:
                         instant.new[path] = choose(opens, rows(x, where), old)
 
 
-@without_collection
-def trace_part_program(layout: FlatLayout, functions: BlockFunctions, name: str) -> PartProgram:
-    """Return "indicators", "jump" or "driven" as a program; a jump takes which events fire as a further argument."""
-    fires = name == "jump"
-    sizes = (layout.width, layout.plant_outputs.total, layout.parameters.total)
-    program = Program(sizes, len(layout.events) if fires else 0)
-    fired = program.more if fires else None
-    instant = evaluate(layout, functions, NONE, program.t, program.x, program.w, program.p, fired=fired)
-    if name == "indicators":
-        return PartProgram.of(program, *map(program.join, indicators_of(instant)))
-    if name == "driven":
-        return PartProgram.of(program, plant_inputs(instant))
-    _let_fire(instant)
-    return PartProgram.of(program, program.join([next_x(instant)]))
-
-
 def trace_loops(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern]) -> Derivative | None:
     """Return ``(t, x, w, p) -> (r, ∂r/∂v)``: what came round the algebraic loops less what was taken, v.
 
@@ -294,11 +271,6 @@ def trace_loops(layout: FlatLayout, functions: BlockFunctions, acting: frozenset
         return {"r": loop_mismatch(evaluate(layout, functions, acting, **symbols, apart=apart))}
 
     return Derivative(trace_schedule("loops", symbols, results), [("x", active)])
-
-
-def differentiate_flow(layout: FlatLayout, flow: Schedule) -> Derivative:
-    """Return ``(t, x, w, p) -> ∂dx/∂x`` by the entries of x that are integrated."""
-    return Derivative(flow, [("x", layout.continuous.tolist())], values=False)
 
 
 def differentiate_flow_with_loops(layout: FlatLayout, functions: BlockFunctions) -> Derivative:

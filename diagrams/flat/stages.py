@@ -31,10 +31,11 @@ are composed with a discretization, which needs them as functions, and their num
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -44,12 +45,10 @@ from .evaluation import Apart, Instant, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
 
 
-class Evaluator(Protocol):
-    """Evaluates a block that the traced functions leave out; its parameters are its own.
+class Evaluator(ABC):
+    """Evaluates a block that the traced functions leave out; its parameters are its own."""
 
-    A protocol: evaluators in runs and in linear models belong to sub-packages above this one.
-    """
-
+    @abstractmethod
     def evaluate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Return the equations that are wanted, one after the other, flat.
 
@@ -64,14 +63,13 @@ class Evaluator(Protocol):
             The block's states and inputs, flat. Inputs that none of ``names`` depends on may be zeros. Behind them, for
             ``"jump"``, is 1 for each event that fires, else 0.
         """
-        ...
 
+    @abstractmethod
     def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
         """Return the derivative of `evaluate` by (t, x, u), shape (n, 1 + x.size + u.size); None: by differences.
 
         A column by t that is not finite is computed by differences, where it is needed.
         """
-        ...
 
 
 Evaluators = Mapping[str, Evaluator]

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...blocks.core import SimulationError, Wanted
 from ...blocks.tracing import GUARDS, NEXT
-from ..flat import JUMP, FlatDiagram, no_evaluator, sort_names
+from ..flat import JUMP, Evaluator, FlatDiagram, no_evaluator, sort_names
 
 _STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference, relative to the nominal value
 Values = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
@@ -124,7 +124,7 @@ class Look(Enum):
     """Events may act there."""
 
 
-class ModelExchangeEvaluator:
+class ModelExchangeEvaluator(Evaluator):
     """Evaluator of one block in a run: for the stages, and for the events."""
 
     def __init__(self, flat: FlatDiagram, path: str):

@@ -234,7 +234,7 @@ def test_it_makes_no_difference_when_generated_code_takes_over(swapped, make, op
 def test_a_run_traces_no_function_of_the_whole_diagram(monkeypatch):
     """But it does in a small diagram, so that the count can tell."""
     traced = []
-    for name in ("trace_tick", "trace_flow"):
+    for name in ("trace_tick", "trace_between"):
         trace = getattr(flat_diagram.flat_functions, name)
         told = lambda *a, of=trace, name=name, **more: (traced.append(name), of(*a, **more))[1]  # noqa: E731
         monkeypatch.setattr(flat_diagram.flat_functions, name, told)
@@ -244,7 +244,7 @@ def test_a_run_traces_no_function_of_the_whole_diagram(monkeypatch):
         parallel(20).simulate(2.0, **QUIET)
         ring(20)[0].simulate(1.0, step=0.01, solver="rk4", **QUIET)
         found.append(set(traced))
-    assert found == [set(), {"trace_tick", "trace_flow"}]
+    assert found == [set(), {"trace_tick", "trace_between"}]
 
 
 def test_an_error_of_a_block_of_python_is_raised_with_its_path_and_time():

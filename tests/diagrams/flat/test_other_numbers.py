@@ -76,7 +76,7 @@ def test_runs_with_events_and_jumps_are_those_of_a_diagram_that_was_made_anew(op
 def test_functions_are_traced_once(monkeypatch):
     diagram = thermostat()
     diagram.simulate(0.2, **QUIET)
-    for name in ("trace_tick", "trace_flow", "trace_indicators", "trace_jump"):
+    for name in ("trace_tick", "trace_between"):
         monkeypatch.setattr(flat_functions, name, lambda *_, **__: pytest.fail("traced again"))
     variant, _ = renumbered(diagram, CHANGES)
     variant.simulate(0.2, **QUIET)
@@ -90,7 +90,7 @@ def test_functions_that_a_variant_asks_for_first_belong_to_all(monkeypatch):
     diagram = thermostat()
     variant, _ = renumbered(diagram, CHANGES)
     variant.simulate(0.2, **QUIET)
-    for name in ("trace_tick", "trace_flow", "trace_indicators", "trace_jump"):
+    for name in ("trace_tick", "trace_between"):
         monkeypatch.setattr(flat_functions, name, lambda *_, **__: pytest.fail("traced again"))
     diagram.simulate(0.2, **QUIET)
 
