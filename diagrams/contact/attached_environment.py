@@ -11,7 +11,7 @@ environment's mass, are sampled `EARLY` of a tick before it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -133,85 +133,108 @@ def attach_environment(
     table = copy_table(diagram, tool)
     taken = {*table.blocks, *table.subsystems}
     name = next(n for n in (BLOCK + "_" * k for k in range(99)) if n not in taken)
-    held_by = f"{name}_sampling"
     shape = np.shape(mooring.anchor)
-    d = np.asarray(mooring.direction).reshape(shape)
-    common: dict[str, Any] = {
-        "direction": d if shape else float(d),
-        "anchor": mooring.anchor if shape else float(mooring.anchor),
-        "stiffness": mooring.stiffness,
-        "damping": mooring.damping,
-        "mass": mooring.mass,
-    }
     push = table.wires.get((path, ports.force), None)
     if push is None:
         push = _add(table, Constant(value=_idle(block, ports.force, shape), name=f"{name}_push"), "y")
     times = (mooring.kick_start, mooring.kick_time)
     kick = _add(table, Step(times=times, values=(mooring.kick, 0.0), name=f"{name}_kick"), "y")
-    at = {"kick": kick, "push": push} | {q: Wire(path, getattr(ports, q)) for q in ("position", "velocity")}
+    inputs = {"kick": kick, "push": push} | {q: Wire(path, getattr(ports, q)) for q in ("position", "velocity")}
+    d = np.asarray(mooring.direction).reshape(shape)
+    values: dict[str, Any] = {
+        "name": name,
+        "direction": d if shape else float(d),
+        "anchor": mooring.anchor if shape else float(mooring.anchor),
+        **{key: getattr(mooring, key) for key in ("stiffness", "damping", "mass")},
+    }
     if held:
         assert tick is not None
-        mobility = float(np.ravel(mooring.direction) @ _mobility(model, ports) @ np.ravel(mooring.direction))
-        table.subsystems[held_by] = SubsystemSettings(held_by, tick / SUBSTEPS, None)
-        made: Block = HeldEnvironment(**common, mobility=mobility, name=name)
-        path_of = f"{held_by}.{name}"
-        felt = Wire(path_of, "force")
+        put_at, forces = _put_held(table, ports, model, values, inputs, tick)
     else:
-        read: dict[str, Wire] = {}
-        if isinstance(block, Fmu) and block.stepped:
-            block = table.blocks[path] = block.replace(interface="model_exchange")
-        if mooring.mass:
-            at["acceleration"] = _find_acceleration(table, ports, model)
-        else:
-            at["acceleration"] = _add(table, Constant(value=np.zeros(shape), name=f"{name}_still"), "y")
-        made, path_of = Environment(**common, name=name), name
-        felt = Wire(path_of, "force")
-        if tick is not None:
-            table.subsystems[held_by] = SubsystemSettings(held_by, tick, None, offset=tick * (1 - EARLY))
-            if diagram.blocks[path].stepped:
-                for port in _find_feedthrough(diagram, path, model):
-                    read[port] = _sample(table, held_by, Wire(path, port), f"{port}_before")
-            _reroute(table, {(path, port): wire for port, wire in read.items()}, keep=path_of)
-    table.blocks[path_of], table.subsystem_of[path_of] = made, path_of.rpartition(".")[0]
-    for port, wire in at.items():
-        table.wires[path_of, port] = wire
-    table.wires[path, ports.force] = Wire(path_of, "total")
+        put_at, forces = _put_in_solver(table, ports, model, values, inputs, tick)
+    table.wires[path, ports.force] = Wire(put_at, "total")
     if measured is not None:
-        terms = [hold_separately(table, measured.port[0], felt, f"{name}_felt")]
-        if not held and mooring.mass:
-            inertia = Wire(path_of, "inertia")
-            terms.append(inertia if tick is None else _sample(table, held_by, inertia, "inertia_before"))
-        add_forces(table, measured, terms, f"{name}_sum", {(path_of, port) for port in at})
+        forces[0] = hold_separately(table, measured.port[0], forces[0], f"{name}_felt")
+        add_forces(table, measured, forces, f"{name}_sum", {(put_at, port) for port in inputs})
     try:
         return diagram.with_structure(table)
     except AlgebraicLoopError:  # by a mass, a continuous controller, or an FMU that does not list its dependencies
         return diagram.with_structure(table, loops="solve")
 
 
-def _add(table: Structure, block: Block, port: str, subsystem: str = "") -> Wire:
+def _put_held(
+    table: Structure,
+    ports: Ports,
+    model: PlantEquations,
+    values: Mapping[str, Any],
+    inputs: Mapping[str, Wire],
+    tick: Fraction,
+) -> tuple[str, list[Wire]]:
+    """Put the environment into a subsystem with communication points; return its path, and the forces that are felt."""
+    subsystem, d = f"{values['name']}_sampling", np.ravel(values["direction"])
+    mobility = model.C[model.outputs.entries([ports.velocity])] @ model.B[:, model.inputs.entries([ports.force])]
+    table.subsystems[subsystem] = SubsystemSettings(subsystem, tick / SUBSTEPS, None)
+    made = HeldEnvironment(**values, mobility=float(d @ np.asarray(mobility) @ d))
+    force = _add(table, made, "force", subsystem, inputs)
+    return force.block, [force]
+
+
+def _put_in_solver(
+    table: Structure,
+    ports: Ports,
+    model: PlantEquations,
+    values: Mapping[str, Any],
+    inputs: Mapping[str, Wire],
+    tick: Fraction | None,
+) -> tuple[str, list[Wire]]:
+    """Put the environment next to a plant with equations; return its path, and the forces that are felt."""
+    path, name = ports.plant, values["name"]
+    block, is_stepped, outputs = table.blocks[path], table.blocks[path].stepped, [*table.blocks[path].outputs]
+    if isinstance(block, Fmu) and is_stepped:
+        table.blocks[path] = block.replace(interface="model_exchange")
+    if values["mass"]:
+        acceleration = _find_acceleration(table, ports, model)
+    else:
+        acceleration = _add(table, Constant(value=np.zeros(np.shape(values["anchor"])), name=f"{name}_still"), "y")
+    sampling = f"{name}_sampling"
+    if tick is not None:
+        table.subsystems[sampling] = SubsystemSettings(sampling, tick, None, offset=tick * (1 - EARLY))
+        if is_stepped:
+            used = {wire.port for wire in table.wires.values() if wire.block == path}
+            early = [port for port in outputs if port in used and np.any(model.D[model.outputs.entries([port])])]
+            before = {(path, port): _sample(table, sampling, Wire(path, port), f"{port}_before") for port in early}
+            _reroute(table, before)
+    force = _add(table, Environment(**values), "force", "", {**inputs, "acceleration": acceleration})
+    forces = [force]
+    if values["mass"]:
+        inertia = Wire(force.block, "inertia")
+        forces.append(inertia if tick is None else _sample(table, sampling, inertia, "inertia_before"))
+    return force.block, forces
+
+
+def _add(
+    table: Structure, block: Block, port: str, subsystem: str = "", inputs: Mapping[str, Wire] | None = None
+) -> Wire:
+    """Add a block with the wires of its inputs, and return the wire of one of its outputs."""
     path = f"{subsystem}.{block.name}" if subsystem else str(block.name)
     table.blocks[path], table.subsystem_of[path] = block, subsystem
+    table.wires.update({(path, name): wire for name, wire in (inputs or {}).items()})
     return Wire(path, port)
 
 
 def _sample(table: Structure, subsystem: str, wire: Wire, name: str) -> Wire:
     """Return the wire of a signal that is sampled in a subsystem."""
-    found = _add(table, Hold(name=name), "y", subsystem)
-    table.wires[found.block, "u"] = wire
-    return found
+    return _add(table, Hold(name=name), "y", subsystem, {"u": wire})
 
 
-def _reroute(table: Structure, changes: dict[tuple[str, str], Wire], keep: str) -> None:
-    """Lead the readers of ports to other wires, but for the new blocks that read them themselves."""
-    new = {wire.block for wire in changes.values()} | {keep}
-    for key, wire in list(table.wires.items()):
-        if (wire.block, wire.port) in changes and key[0] not in new:
-            other = changes[wire.block, wire.port]
-            table.wires[key] = Wire(other.block, other.port, wire.index)
-    for path, wire in list(table.controls.items()):
-        if (wire.block, wire.port) in changes:
-            other = changes[wire.block, wire.port]
-            table.controls[path] = Wire(other.block, other.port, wire.index)
+def _reroute(table: Structure, changes: Mapping[tuple[str, str], Wire]) -> None:
+    """Lead the readers of ports to other wires, but for the blocks that these come from."""
+    new = {wire.block for wire in changes.values()}
+    for group in (table.wires, table.controls):
+        for key, wire in list(group.items()):
+            if (wire.block, wire.port) in changes and not (isinstance(key, tuple) and key[0] in new):
+                other = changes[wire.block, wire.port]
+                group[key] = Wire(other.block, other.port, wire.index)  # type: ignore[index]
 
 
 def _idle(block: Block, port: str, shape: tuple[int, ...]) -> Any:
@@ -221,20 +244,6 @@ def _idle(block: Block, port: str, shape: tuple[int, ...]) -> Any:
         name = {new: old for old, new in block.rename.items()}.get(port, port)
         value = block.start.get(name, block.description.find(name).start)
     return np.broadcast_to(np.asarray(0.0 if value is None else value, dtype=float), shape).copy()
-
-
-def _mobility(model: PlantEquations, ports: Ports) -> np.ndarray:
-    return np.asarray(
-        model.C[model.outputs.entries([ports.velocity])] @ model.B[:, model.inputs.entries([ports.force])]
-    )
-
-
-def _find_feedthrough(diagram: WiredDiagram, path: str, model: PlantEquations) -> Iterable[str]:
-    """Return the outputs of a plant that its inputs act on at once, and that something reads."""
-    used = {wire.port for wire in diagram.scheduled.wires.values() if wire.block == path}
-    return [
-        port for port in diagram.blocks[path].outputs if port in used and np.any(model.D[model.outputs.entries([port])])
-    ]
 
 
 def _find_acceleration(table: Structure, ports: Ports, model: PlantEquations) -> Wire:
