@@ -9,7 +9,7 @@ and the linear models of the FMUs.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -403,23 +403,14 @@ def _solve_trim(
     worst = float(left[order[0]]) if order else 0.0
     x, w, xp, q = equations.split(unknown)
     free = find_free_directions(equations, unknown) if how is PointOrigin.TRIM else ()
+    changed, z = equations.plants.change_blocks(parameters, q), equations.residual_at(unknown)[2]
     if not worst <= tolerance:
         shown = "; ".join(f"{name}: {value:.3g}" for name, value in list(residuals.items())[:5])
+        hidden = equations.plants.find_unmoved(xp, z, residuals, changed, tolerance)
         stuck = [f.name for f, v in zip(parameters, q, strict=True) if f.is_at_bound(v)]
-        advice = f"{', '.join(stuck)} is at its bound. " if stuck else ""
-        advice += "Free more parameters or states, widen bounds, begin nearer with at=…, or take the nearest point "
-        advice += "with tolerance=…."
-        changed, z = equations.plants.change_blocks(parameters, q), equations.residual_at(unknown)[2]
-        if hidden := equations.plants.find_unmoved(xp, z, residuals, changed, tolerance):
-            said = (
-                "FMUs list no states in their descriptions"
-                if len(hidden) > 1
-                else "FMU lists no states in its description"
-            )
-            advice = f"The {said} ({', '.join(hidden)}), so a trim can't move the outputs to their rest. {RUN_INSTEAD}"
         raise SimulationError(
             f"no operating point was found: relative to 1 + their size, these equations have the residuals {shown}; "
-            f"expected at most {tolerance:g}. {advice}",
+            f"expected at most {tolerance:g}. {_advise(hidden, stuck)}",
             block=diagram.name,
             t=guess.t,
         )
@@ -433,27 +424,29 @@ def _solve_trim(
             block=diagram.name,
             t=guess.t,
         )
-    changed = equations.plants.change_blocks(parameters, q)
-    plants = equations.plants.points(xp, equations.residual_at(unknown)[2], changed)
+    plants = equations.plants.points(xp, z, changed)
     # an FMU that lists no states may move, though no equation holds it
     drift = equations.plants.drift(plants, changed) if how is PointOrigin.TRIM else {}
     check_drift(drift, tolerance, diagram.name, guess.t)
     residuals = dict(sorted((residuals | drift).items(), key=lambda r: -r[1]))
-    point = _complete_point(
-        final,
-        guess,
-        x,
-        w,
-        plants,
-        {
-            "parameters": {**guess.parameters, **values},
-            "residuals": residuals,
-            "how": how,
-            "free": free,
-        },
-    )
+    parameters_found = {**guess.parameters, **values}
+    facts = {"parameters": parameters_found, "residuals": residuals, "how": how, "free": free}
+    point = _complete_point(final, guess, x, w, plants, facts)
     most = max(drift, key=drift.__getitem__, default="")
     return replace(point, residual=drift[most], largest=most) if most and drift[most] > point.residual else point
+
+
+def _advise(hidden: Sequence[str], stuck: Sequence[str]) -> str:
+    """Return the next step where no point was found: ``hidden`` are FMUs with a memory, ``stuck`` names at a bound."""
+    if hidden:
+        many = len(hidden) > 1
+        said = "FMUs list no states in their descriptions" if many else "FMU lists no states in its description"
+        return f"The {said} ({', '.join(hidden)}), so a trim can't move the outputs to their rest. {RUN_INSTEAD}"
+    at_bound = f"{', '.join(stuck)} is at its bound. " if stuck else ""
+    return (
+        f"{at_bound}Free more parameters or states, widen bounds, begin nearer with at=…, or take the nearest point "
+        "with tolerance=…."
+    )
 
 
 def _complete_point(

@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from fractions import Fraction
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core import FmuError, OptionError
 from ..flat import WiredDiagram
-from ..results import OperatingPoint, PointOrigin
+from ..linearization import RUN_OPTIONS, PointLike, operating_point
+from ..results import OperatingPoint, PointOrigin, Snapshot
 from ..simulation import Simulation, apply_point
+from ..wiring import exact_time
 
 AGAIN = 1e-3
 """Largest deviation of a repeated run from its operating point, relative to 1 + the size of a state or an output."""
+EXACT = MappingProxyType({"rtol": 1e-9, "atol": 1e-12})
+"""Tolerances of a solver."""
 
 
 def divide_time(t: Fraction, longest: Fraction) -> Fraction:
@@ -46,6 +52,47 @@ def can_start_at(diagram: WiredDiagram, point: OperatingPoint) -> bool:
     except FmuError:
         return False
     return True
+
+
+def find_beginning(
+    diagram: WiredDiagram, at: PointLike, options: dict[str, Any]
+) -> tuple[dict[str, Any], OperatingPoint | None, float]:
+    """Return the options of the run and its beginning: an operating point to start from, or None and a time in s."""
+    if isinstance(at, Snapshot):
+        recipe = dict(getattr(at.run, "recipe", {}) or {})
+        options = {**recipe, **options}
+        if "start" not in options:
+            return options, None, at.t
+    if isinstance(at, OperatingPoint) and at.how == PointOrigin.RUN and "start" not in options:
+        return {**options, "step": options.get("step") or at.base}, None, at.t
+    if at is None or (isinstance(at, int | float) and not isinstance(at, bool) and "start" not in options):
+        return options, None, float(at or 0.0)
+    point = operating_point(diagram, at, options)
+    options.pop("start", None)
+    if not diagram.has_clock and options.get("step") is None and diagram.has_fmu:
+        options["step"] = point.base
+    return options, point, point.t
+
+
+def find_continuous_beginning(
+    diagram: WiredDiagram, at: PointLike, options: dict[str, Any], longest: Fraction
+) -> tuple[dict[str, Any], OperatingPoint | None, float]:
+    """Return what `find_beginning` does, for a diagram without sampling: ticks of any length have its point's time.
+
+    They are ``step`` apart, where that is among the options, or else ``longest``, or less so that one is at the point.
+    """
+    if isinstance(at, Snapshot):
+        recipe = getattr(at.run, "recipe", {}) or {}
+        options = {**{name: value for name, value in recipe.items() if name != "step"}, **options}
+    if options.get("step") is not None:
+        longest = exact_time(options["step"], block=diagram.name)
+    is_start = at is None or (isinstance(at, OperatingPoint) and at.how == PointOrigin.RUN and at.t == 0.0)
+    if "start" not in options and (is_start or (isinstance(at, int | float) and at == 0.0)):
+        return {**options, "step": longest}, None, 0.0
+    run = {name: value for name, value in options.items() if name in RUN_OPTIONS and name != "step"}
+    point = with_ticks(operating_point(diagram, at, {**EXACT, **run}), longest)
+    options.pop("start", None)
+    return {**options, "step": point.base}, point, point.t
 
 
 def check_reached(simulation: Simulation, point: OperatingPoint) -> None:

@@ -35,8 +35,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,18 +43,14 @@ from numpy.typing import ArrayLike
 from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
 from ..flat import WiredDiagram
 from ..linearization import (
-    RUN_OPTIONS,
     PointLike,
     carry_point,
     cut_to,
     find_signal,
-    operating_point,
     ticks_to_renewal,
 )
-from ..results import OperatingPoint, PointOrigin, Snapshot
 from ..solvers import FIXED
-from ..wiring import exact_time
-from .beginning import with_ticks
+from .beginning import EXACT, find_beginning, find_continuous_beginning
 from .between_samples import moves_between
 from .injection import InjectionRun, inject_signal
 from .measurement import Measurement, measure_part, refine_tolerances
@@ -69,8 +63,6 @@ if TYPE_CHECKING:
 
 HALF = 0.5
 """Factor of the amplitude in the second measurement."""
-EXACT = MappingProxyType({"rtol": 1e-9, "atol": 1e-12})
-"""Tolerances of a solver."""
 GROWN = 1e9
 """Growth of a signal, relative to the test signal and to the states before it, that no stable loop makes."""
 
@@ -287,9 +279,9 @@ def frequency_response(
     omega, amplitude = np.unique(np.atleast_1d(np.asarray(frequencies, dtype=float))), float(amplitude)
     discrete = diagram.has_clock or diagram.has_fmu
     if discrete:
-        chosen, point, t0 = _find_beginning(diagram, at, dict(options))
+        chosen, point, t0 = find_beginning(diagram, at, dict(options))
     else:
-        chosen, point, t0 = _find_continuous_beginning(diagram, at, dict(options), choose_step(omega))
+        chosen, point, t0 = find_continuous_beginning(diagram, at, dict(options), choose_step(omega))
     variant = diagram.replace(point.parameters) if point is not None and point.parameters else diagram
     flat = variant.flatten(chosen.get("step", None if point is None or diagram.has_clock else point.base))
     every = math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
@@ -361,44 +353,3 @@ def frequency_response(
         labels,
         consumers,
     )
-
-
-def _find_beginning(
-    diagram: WiredDiagram, at: PointLike, options: dict[str, Any]
-) -> tuple[dict[str, Any], OperatingPoint | None, float]:
-    """Return the options of the run and its beginning: an operating point to start from, or None and a time in s."""
-    if isinstance(at, Snapshot):
-        recipe = dict(getattr(at.run, "recipe", {}) or {})
-        options = {**recipe, **options}
-        if "start" not in options:
-            return options, None, at.t
-    if isinstance(at, OperatingPoint) and at.how == PointOrigin.RUN and "start" not in options:
-        return {**options, "step": options.get("step") or at.base}, None, at.t
-    if at is None or (isinstance(at, int | float) and not isinstance(at, bool) and "start" not in options):
-        return options, None, float(at or 0.0)
-    point = operating_point(diagram, at, options)
-    options.pop("start", None)
-    if not diagram.has_clock and options.get("step") is None and diagram.has_fmu:
-        options["step"] = point.base
-    return options, point, point.t
-
-
-def _find_continuous_beginning(
-    diagram: WiredDiagram, at: PointLike, options: dict[str, Any], longest: Fraction
-) -> tuple[dict[str, Any], OperatingPoint | None, float]:
-    """Return what `_find_beginning` does, for a diagram without sampling: ticks of any length have its point's time.
-
-    They are ``step`` apart, where that is among the options, or else ``longest``, or less so that one is at the point.
-    """
-    if isinstance(at, Snapshot):
-        recipe = getattr(at.run, "recipe", {}) or {}
-        options = {**{name: value for name, value in recipe.items() if name != "step"}, **options}
-    if options.get("step") is not None:
-        longest = exact_time(options["step"], block=diagram.name)
-    is_start = at is None or (isinstance(at, OperatingPoint) and at.how == PointOrigin.RUN and at.t == 0.0)
-    if "start" not in options and (is_start or (isinstance(at, int | float) and at == 0.0)):
-        return {**options, "step": longest}, None, 0.0
-    run = {name: value for name, value in options.items() if name in RUN_OPTIONS and name != "step"}
-    point = with_ticks(operating_point(diagram, at, {**EXACT, **run}), longest)
-    options.pop("start", None)
-    return {**options, "step": point.base}, point, point.t
