@@ -2,7 +2,7 @@
 
 from .computed import trace_initial, trace_numbers
 from .differences import differentiate, extrapolate
-from .discretization import check_method, find_hold, hold
+from .discretization import METHOD, check_method, find_hold, hold
 from .equations import initial_state, is_only_sampled, start_shapes, start_values, state_after_start
 from .model_exchange import describe_model_exchange
 from .numpy_check import GUARDS, NEXT, Columns, Point, Values, evaluate
@@ -17,6 +17,7 @@ from .traced_array import as_traced
 __all__ = [
     "GUARDS",
     "MATH_FUNCTIONS",
+    "METHOD",
     "NEXT",
     "Columns",
     "Line",

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..core import ParameterError, SampleTimeError, accepts, kinds
+from ..core import ParameterError, SampleTimeError, accepts, check_argument, kinds
 from .symbolic_hold import hold_of_symbols, holds_symbols
 
 Method = Literal["exact", "forward", "semi_implicit", "trapezoidal"]
-METHODS = ("exact", "forward", "semi_implicit", "trapezoidal")
+_METHODS = get_args(Method)
+METHOD = kinds.choice(*_METHODS).worded(
+    f"one of {', '.join(_METHODS)}", found=lambda name, method: f"found the method {method!r}"
+)
+"""Kind of the name of a discretization."""
 
 
-def check_method(method: str) -> None:
-    """Raise `SampleTimeError` unless ``method`` names a discretization."""
-    if not isinstance(method, str) or method not in METHODS:
-        raise SampleTimeError(f"found the method {method!r}; expected one of {', '.join(METHODS)}.")
+def check_method(method: str, block: str | None = None) -> None:
+    """Raise `SampleTimeError` unless ``method`` names a discretization, that of a subsystem or block, say."""
+    check_argument(method, METHOD, "method", block, SampleTimeError)
 
 
 @accepts(A=kinds.matrix, T=kinds.number, method=kinds.text)
@@ -46,7 +49,7 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
 
 def find_hold(A: Any, T: float, method: str) -> tuple[Any, Any]:
     """Return the matrices of `hold`, from arguments of known kinds: a sweep does so for each of its runs."""
-    check_method(method)
+    check_method(method, "hold")
     if holds_symbols(A):  # a block's parameters, where it is exported
         return hold_of_symbols(A, T, method)
     A = np.atleast_2d(np.asarray(A, dtype=float))

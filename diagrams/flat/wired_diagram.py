@@ -203,7 +203,7 @@ class WiredDiagram:
 
     def sampled(self, sample_time: float | Fraction, method: str = "exact") -> WiredDiagram:
         """Return the diagram with all its continuous blocks sampled; see `Diagram.sampled`."""
-        check_method(method)
+        check_method(method, self.name)
         table = self.structure.copy()
         for path, settings in sorted(table.subsystems.items()):
             if self.structure.clock(path) is None:

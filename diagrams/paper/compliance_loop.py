@@ -61,7 +61,7 @@ from ...blocks import (
 from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, kinds, parameter
 from ...blocks.path_following import A_MODEL, A_PATH, planar_slopes
 from ...blocks.paths import Frame
-from ...blocks.tracing import check_method
+from ...blocks.tracing import METHOD
 from ..contact import SIDES, Contact, PortNames, Tool, make_contact
 from ..diagram import Diagram
 from ..flat import WiredDiagram
@@ -127,7 +127,7 @@ class AdmittanceLoop(Value):
     )
     sample_time: float = parameter(default=1e-3, unit="s", above=0.0, description="sample time T")
     delay: int = parameter(default=0, minimum=0, maximum=100, description="samples of computational delay")
-    method: str = parameter(default="exact", description="discretization of the admittance")
+    method: str = parameter(default="exact", description="discretization of the admittance", kind=METHOD)
     feed_forward: float = parameter(default=1.0, unit="1", description="share φ of ë that is fed forward")
     cancelled: float = parameter(default=1.0, unit="1", description="share β of the measured force that is cancelled")
     tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass beyond the force sensor, of M")
@@ -195,7 +195,6 @@ class AdmittanceLoop(Value):
 
     def check(self) -> None:
         """Refuse parameters that don't make a loop."""
-        check_method(self.method)
         left, right = self.path.reach(self.path.parameter_at(self.eta))
         if not -float(right) < self.xi < float(left) or self.q <= 0.0:
             raise ParameterError(

@@ -17,9 +17,10 @@ from ...fmus import Fmu
 from ...fmus.platform import cache_folder, explain_cache_errors, is_built_here, record_build
 from ..flat import WiredDiagram
 from .outcome import SampleOutcome
-from .plan import Plan, Worker
+from .plan import Plan
 from .processes import to_bytes
 from .samples import Sample
+from .worker import Worker
 from .workers import make_worker
 
 _CHUNKS = 8
@@ -79,7 +80,7 @@ def _keep(digest: str, content: bytes, *, built: bool) -> Path:
 # --- on the workers ------------------------------------------------------------------------------------------------
 
 
-class _Bench:
+class _WorkerPool:
     """The workers of one sweep in this process: each thread that runs a chunk takes one, and puts it back."""
 
     def __init__(self, plan: Plan):
@@ -104,8 +105,8 @@ class _Bench:
             self.idle.clear()
 
 
-_benches: dict[str, _Bench] = {}
-_making = threading.Lock()
+_pools: dict[str, _WorkerPool] = {}
+_pools_change = threading.Lock()
 
 
 def deliver(content: bytes) -> bytes:
@@ -115,21 +116,21 @@ def deliver(content: bytes) -> bytes:
 
 def run_chunk(key: str, parcel: bytes, digests: Sequence[str], samples: Sequence[Sample], *contents: bytes) -> Any:
     """Run samples on a worker of a cluster, and return their outcomes."""
-    with _making:
-        if key not in _benches:
+    with _pools_change:
+        if key not in _pools:
             found: Parcel = pickle.loads(parcel)
-            _benches[key] = _Bench(found.unpack(dict(zip(digests, contents, strict=True))))
-        bench = _benches[key]
-    with one_thread(), bench.take() as worker:
+            _pools[key] = _WorkerPool(found.unpack(dict(zip(digests, contents, strict=True))))
+        pool = _pools[key]
+    with one_thread(), pool.take() as worker:
         return [*worker.run_all(samples)]
 
 
 def release(key: str) -> None:
     """Free what a sweep holds in this process."""
-    with _making:
-        bench = _benches.pop(key, None)
-    if bench is not None:
-        bench.close()
+    with _pools_change:
+        pool = _pools.pop(key, None)
+    if pool is not None:
+        pool.close()
 
 
 # --- here ------------------------------------------------------------------------------------------------------------

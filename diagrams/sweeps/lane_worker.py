@@ -18,10 +18,11 @@ from ..results import Run, Stopped, machine_memory
 from ..simulation import START_EXCHANGES, StopConditions, newton_options
 from .bound_run import BoundRun, Progress
 from .outcome import SampleOutcome
-from .plan import Plan, Worker
+from .plan import Plan
 from .samples import Sample
 from .variation import Numbers
 from .vector_start import StartSearch, VectorStart
+from .worker import Worker
 
 DIFFER = (
     "Side by side in vector lanes: values differ from those of single runs by rounding, which some motions magnify."

@@ -1,32 +1,31 @@
-"""A sweep as a value that can be sent to workers, and the worker that runs its samples."""
+"""A sweep without its samples, as a value that can be sent to workers: its runs, and what is kept of each."""
 
 from __future__ import annotations
 
-import math
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from types import TracebackType
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
-from ...blocks.core import LoopwrightError, SimulationError
+from ...blocks.core import OptionError
 from ...fmus import Fmu
 from ...fmus.platform import is_built_here
 from ...fmus.running import setup_of
-from ..flat import WiredDiagram
-from ..results import RecordedSignals, Run
-from ..simulation import RunOptions, simulate
-from .bound_run import BoundRun, Progress
-from .outcome import Failure, SampleOutcome
-from .reductions import Reduction
+from ..flat import FlatDiagram, WiredDiagram
+from ..results import RecordedSignals, Run, machine_memory
+from ..simulation import RunOptions, Simulation
+from .reductions import Reduction, check_reductions
 from .samples import Sample, seed_of
-from .variation import Numbers, Variation
+from .variation import is_number
 
-_BOUND = 4
-"""Diagrams of different structure that a worker keeps bound at a time."""
+LANES = 8
+"""Runs that go side by side where ``lanes=True``."""
+REFUSED = {
+    "to": "of a sweep, to= is the folder of its results",
+    "overwrite": "of a sweep, overwrite= belongs to its folder",
+}
+"""Options of a run that a sweep has itself, with what to write."""
+_TAKEN = ("failed", "failure", "end_time", "sample", "step", "t")
+"""Names that the data set of a sweep has for itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,129 +79,90 @@ class Plan:
         return {path: block for path, block in self.diagram.scheduled.blocks.items() if isinstance(block, Fmu)}
 
 
-class Worker:
-    """Runs samples of a sweep, one after the other; used in a ``with`` statement."""
+def make_plan(
+    diagram: WiredDiagram,
+    duration: float,
+    signals: str | Iterable[str],
+    reduce: Mapping[str, Callable[[Run], Any]] | None,
+    seeds: str | Iterable[str],
+    options: Mapping[str, Any],
+    *,
+    count: int = 1,
+    lanes: bool | int = False,
+) -> Plan:
+    """Return a sweep as a value, with its names and options checked."""
+    name = diagram.name
+    for option, reason in REFUSED.items():
+        if option in options:
+            raise OptionError(f"found it as an option of a run; {reason}.", block=name, port=option)
+    chosen = (signals,) if isinstance(signals, str) else tuple(signals)
+    reductions = {} if reduce is None else check_reductions(reduce, name)
+    if not chosen and not reductions:
+        raise OptionError(
+            "a sweep keeps what it is asked for, and nothing was asked for. Give signals=['y'], whose samples are "
+            "kept, or reduce={'end': final('y')}, numbers of each run.",
+            block=name,
+        )
+    paths = [diagram.find_parameter(path) for path in ((seeds,) if isinstance(seeds, str) else seeds)]
+    if isinstance(record := options.get("record"), Iterable) and not isinstance(record, str):
+        options = {**options, "record": tuple(record)}  # for each of the runs
+    compiled = all(is_number(diagram, path) for path in paths)  # else each sample would be compiled again
+    side_by_side = (LANES if lanes else 1) if isinstance(lanes, bool) else int(lanes)
+    plan = Plan(diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths), side_by_side)
+    flat = Simulation(diagram, plan.run_options, duration=duration).flat  # it checks the options
+    signals_of_runs = RecordedSignals.of(flat)
+    needed = [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]
+    _check_recorded(plan, signals_of_runs, [signals_of_runs.resolve(signal) for signal in needed])
+    if clash := sorted(set(chosen) & set(reductions)):
+        raise OptionError(
+            f"found {clash[0]!r} among signals and reductions; give the reduction another name.", block=name
+        )
+    width = sum(signals_of_runs.entries(signals_of_runs.resolve(name)).size for name in chosen)
+    _check_room(plan, flat, count, width)
+    return plan
 
-    width = 1
-    """Samples that it is best given at a time."""
 
-    def __init__(self, plan: Plan):
-        self.plan, self._options = plan, plan.run_options
-        self._variation = Variation(plan.diagram)
-        self._bound: OrderedDict[Any, BoundRun] = OrderedDict()
-        self._known_units: tuple[RecordedSignals, dict[str, str]] | None = None
-        self._alone = plan.obstacle
-        """Why each run needs its own set-up, as a clause, where it does."""
-        self._repeats = not self._alone
+def _check_recorded(plan: Plan, signals: RecordedSignals, needed: Iterable[str]) -> None:
+    """Refuse a ``record`` that lacks signals that are kept, or reduced."""
+    if plan.options.get("record") is None:
+        return
+    recorded = signals.choose(plan.run_options.record, states=False)
+    if missing := list(dict.fromkeys(name for name in needed if name not in recorded)):
+        raise OptionError(
+            f"found a choice without {', '.join(map(repr, missing))}, which signals= or reduce= need; expected all "
+            "that the sweep keeps. Add them, or leave record= out: each run then records what is kept alone.",
+            block=plan.diagram.name,
+            port="record",
+        )
 
-    def __enter__(self) -> Worker:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with ExitStack() as stack:
-            for bound in self._bound.values():
-                stack.push(bound.__exit__)
-            self._bound.clear()
+def check_names(plan: Plan, swept: Sequence[str]) -> None:
+    """Refuse a seed for a parameter that has values, and reductions whose names the data set needs."""
+    if twice := [path for path in plan.seeds if path in swept]:
+        raise OptionError(
+            f"found {twice[0]!r} among the parameters and in seeds; it would take the seed, and not its values. Give "
+            "it in one of them.",
+            block=plan.diagram.name,
+            port="seeds",
+        )
+    if taken := [name for name in plan.reductions if name in swept or name in _TAKEN]:
+        raise OptionError(
+            f"found a reduction called {taken[0]!r}; the results have something else by that name. Give it another "
+            "name.",
+            block=plan.diagram.name,
+            port="reduce",
+        )
 
-    def can_compile(self, sample: Sample) -> bool:
-        """Whether a sample's run goes from tick to tick in C; it is prepared, and not run."""
-        try:
-            bound = self._bind(self._variation.find(self.plan.parameters_of(sample))) if self._repeats else None
-        except LoopwrightError:  # of this sample; its run will raise it
-            return False
-        return bound is not None and bound.is_compiled
 
-    def run_all(self, samples: Iterable[Sample], progress: Progress = lambda t: None) -> Iterator[SampleOutcome]:
-        """Yield the outcomes of some samples; see `run`."""
-        for sample in samples:
-            yield self.run(sample, progress)
-
-    def run(self, sample: Sample, progress: Progress = lambda t: None) -> SampleOutcome:
-        """Run a sample; a run that fails is an outcome, too. An exception that ``progress`` raises ends the run."""
-        return self._judge(sample, lambda: self._simulate(self.plan.parameters_of(sample), progress))
-
-    def _judge(self, sample: Sample, make: Callable[[], Run]) -> SampleOutcome:
-        """Return the outcome of a sample whose run is made here, whether it fails or not."""
-        try:
-            return self._outcome(sample, make())
-        except LoopwrightError as error:
-            run = error.run if isinstance(error, SimulationError) else None
-            reached = float(run.t[-1]) if run is not None and len(run.t) else math.nan
-            kind, block, port = type(error).__name__, error.block or "", error.port or ""
-            failure = Failure(sample.index, kind, str(error), reached, block, port)
-            if run is None or not len(run.t):
-                return SampleOutcome(sample.index, failure=failure)
-            return self._with_samples(SampleOutcome(sample.index, failure=failure), run)
-
-    # --- its runs ----------------------------------------------------------------------------------------------------
-
-    def _simulate(self, parameters: Mapping[str, Any], progress: Progress) -> Run:
-        numbers = self._variation.find(parameters)
-        bound = self._bind(numbers) if self._repeats else None
-        if bound is None or not bound.fits(numbers):
-            return simulate(numbers.make_diagram(), self.plan.duration, self._options, progress=False)
-        try:
-            return bound.run(numbers, progress)
-        finally:
-            if bound.is_broken:
-                del self._bound[numbers.key]
-                bound.__exit__(None, None, None)
-
-    def _bind(self, numbers: Numbers) -> BoundRun | None:
-        """Return the bound runs of a diagram; None where each run needs its own set-up."""
-        if numbers.key not in self._bound:
-            bound = BoundRun(numbers.diagram, self.plan.duration, self._options)
-            try:
-                bound.__enter__()
-            except SimulationError as error:  # at these numbers; others may do
-                self._alone = f"the diagram's own numbers give no start ({error})"
-                return None
-            if obstacle := bound.obstacle:
-                self._alone = obstacle
-                bound.__exit__(None, None, None)
-                self._repeats = self._repeats and numbers.key is not None
-                return None
-            self._bound[numbers.key] = bound
-            if len(self._bound) > _BOUND:
-                self._bound.popitem(last=False)[1].__exit__(None, None, None)
-        self._bound.move_to_end(numbers.key)
-        return self._bound[numbers.key]
-
-    # --- their outcomes ----------------------------------------------------------------------------------------------
-
-    def _outcome(self, sample: Sample, run: Run) -> SampleOutcome:
-        numbers = {name: self._reduce(name, function, run) for name, function in self.plan.reductions.items()}
-        stopped = "" if run.stopped is None else run.stopped.block
-        return self._with_samples(SampleOutcome(sample.index, numbers, stopped=stopped), run)
-
-    def _with_samples(self, outcome: SampleOutcome, run: Run) -> SampleOutcome:
-        """Return an outcome with the samples that are kept of a run."""
-        t = run.t.copy() if self.plan.signals else None
-        signals = {name: np.array(run[name]) for name in self.plan.signals}
-        end, units = float(run.t[-1]), self._units(run)
-        return replace(outcome, t=t, signals=signals, end=end, units=units, messages=run.messages)
-
-    def _reduce(self, name: str, function: Callable[[Run], Any], run: Run) -> np.ndarray:
-        try:
-            found = function(run)
-            if found is None:
-                raise TypeError("it returned None; expected a number, or an array. Is a return missing?")
-            return np.array(found, dtype=float)
-        except LoopwrightError:
-            raise
-        except Exception as error:
-            said = f"{type(error).__name__}: {error}".rstrip(".")
-            text = f"the reduction {name!r} failed: {said}. Try it on a single run."
-            failure = SimulationError(text, block=self.plan.diagram.name, port=name, t=float(run.t[-1]))
-            raise failure.keep(run) from error
-
-    def _units(self, run: Run) -> Mapping[str, str]:
-        if self._known_units is None or self._known_units[0] is not run.signals:
-            found = {name: run.unit(name) for name in self.plan.signals}
-            for name, function in self.plan.reductions.items():
-                if isinstance(function, Reduction):
-                    found[name] = run.unit(function.signal) if function.unit is None else function.unit
-            self._known_units = run.signals, {name: str(unit) for name, unit in found.items() if unit}
-        return self._known_units[1]
+def _check_room(plan: Plan, flat: FlatDiagram, count: int, width: int) -> None:
+    """Refuse a sweep whose samples, of ``width`` numbers at each instant, can't fit into memory."""
+    rows = int(plan.duration / float(flat.base)) // int(plan.run_options.every) + 2
+    needed, there = 2 * 8 * (width + 1) * rows * count, machine_memory()
+    if plan.signals and needed > 0.8 * there:
+        raise OptionError(
+            f"found {count} samples of {rows} instants with {width} numbers each; they need {needed / 2**30:.0f} GiB, "
+            f"and this machine has {there / 2**30:.0f}. Keep reductions, such as reduce={{'end': final('y')}}, fewer "
+            "signals, or one of so many instants: every=10.",
+            block=plan.diagram.name,
+            port="signals",
+        )

@@ -6,9 +6,10 @@ from collections.abc import Generator, Iterable
 from functools import partial
 
 from .outcome import SampleOutcome
-from .plan import Plan, Worker
+from .plan import Plan
 from .sample_queue import SampleQueue
 from .samples import Sample
+from .worker import Worker
 from .workers import make_worker
 
 

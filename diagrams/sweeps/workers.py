@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from .plan import Plan, Worker
+from .plan import Plan
+from .worker import Worker
 
 
 def make_worker(plan: Plan) -> Worker:

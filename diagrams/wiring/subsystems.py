@@ -114,12 +114,12 @@ class Subsystem(ShownAsTable):
         enabled: str | None = None,
         triggered: str | None = None,
     ):
-        if method is not None:
-            check_method(method)
         self.function, self.method = function, method
         own = str(getattr(function, "__name__", ""))  # a functools.partial has none, a lambda no identifier
         own = own if own.isidentifier() else "subsystem"
         self.name = check_name(name or own)
+        if method is not None:
+            check_method(method, self.name)
         self.sample_time = None if sample_time is None else exact_time(sample_time, block=self.name)
         self.offset = exact_offset(offset, self.sample_time, block=self.name)
         self.delay = check_delay(delay, self.sample_time, block=self.name)

@@ -149,7 +149,7 @@ def _change_subsystem(settings: SubsystemSettings, key: str, value: Any) -> Subs
     if key == "sample_time" and value is not None:
         new = exact_time(value, block=path)
     elif key == "method" and value is not None:
-        check_method(value)
+        check_method(value, path)
     elif key == "offset":
         new = exact_offset(value, settings.sample_time, block=path)
     elif key == "delay":

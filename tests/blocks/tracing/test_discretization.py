@@ -165,5 +165,7 @@ def test_a_method_that_is_none_is_refused():
         SampleTimeError, match=r"found the method 'euler'; expected one of exact, forward, semi_implicit, trap"
     ):
         hold(np.eye(1), 0.1, "euler")
-    with pytest.raises(SampleTimeError, match="found the method 'implicit'"):
+    with pytest.raises(
+        SampleTimeError, match=r"subsystem\.method: found the method 'implicit'; .* Did you mean 'semi_im"
+    ):
         subsystem(sample_time=0.1, method="implicit")(lambda u: Integrator()(u))

@@ -463,6 +463,7 @@ def test_the_loop_of_a_diagram_has_its_parameters():
             "velocity: found [0.0, 0.1] m/s where the path is curved",
         ),
         ({"delay": -1}, "delay: found -1; expected a value at least 0"),
+        ({"method": "euler"}, "method: found the method 'euler'; expected one of exact, forward"),
     ],
 )
 def test_what_can_not_be_reduced_is_refused(change, text):

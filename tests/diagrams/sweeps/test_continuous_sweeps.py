@@ -157,7 +157,7 @@ def test_runs_that_follow_each_other_in_one_thread_have_the_bits_of_single_ones(
 @pytest.mark.parametrize("case", ["a jump at the start", "loop at ticks"])
 def test_they_run_in_threads_with_the_same_bits(case, monkeypatch):
     make, parameters, duration, options = CASES[case]
-    monkeypatch.setattr(sys.modules["loopwright.diagrams.sweeps.sweep"], "run_in_processes", None)
+    monkeypatch.setattr(sys.modules["loopwright.diagrams.sweeps.ways_to_run"], "run_in_processes", None)
     two, one = (
         make().sweep(parameters, duration, signals="y", workers=workers, **options, **QUIET) for workers in (2, 1)
     )

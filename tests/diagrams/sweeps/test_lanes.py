@@ -20,8 +20,8 @@ from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, lane_worker, maximum, mean, minimum, settling_time
 from loopwright.diagrams.sweeps.bound_run import BoundRun
 from loopwright.diagrams.sweeps.lane_worker import DIFFER
+from loopwright.diagrams.sweeps.plan import make_plan
 from loopwright.diagrams.sweeps.samples import Sample
-from loopwright.diagrams.sweeps.sweep import make_plan
 from loopwright.diagrams.sweeps.workers import make_worker
 from loopwright.fmus import Fmu
 from loopwright.fmus.models import bouncing_ball

@@ -9,9 +9,9 @@ from loopwright.blocks import Constant, DiscreteTransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, maximum
 from loopwright.diagrams.sweeps.bound_run import BoundRun
-from loopwright.diagrams.sweeps.plan import Worker
+from loopwright.diagrams.sweeps.plan import make_plan
 from loopwright.diagrams.sweeps.samples import Sample
-from loopwright.diagrams.sweeps.sweep import make_plan
+from loopwright.diagrams.sweeps.worker import Worker
 from loopwright.diagrams.sweeps.workers import make_worker
 
 KEPT = {"xi": final("xi"), "force": maximum("motor_force")}
@@ -83,9 +83,9 @@ def test_runs_side_by_side_are_started_together(diagram):
 
 def test_the_first_tick_of_a_compiled_run_is_evaluated_in_c(diagram):
     with diagram.simulation(compile=True) as simulation:
-        assert simulation._engine.workspace.native
+        assert simulation._engine.workspace._native
     with diagram.simulation(compile=False) as simulation:
-        assert not simulation._engine.workspace.native
+        assert not simulation._engine.workspace._native
 
 
 def test_a_block_is_built_once_for_all_of_its_parameters(monkeypatch):

@@ -25,9 +25,9 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, maximum, mean, minimum, settling_time
-from loopwright.diagrams.sweeps.plan import Worker
+from loopwright.diagrams.sweeps.plan import make_plan
 from loopwright.diagrams.sweeps.samples import Samples
-from loopwright.diagrams.sweeps.sweep import make_plan
+from loopwright.diagrams.sweeps.worker import Worker
 from loopwright.diagrams.sweeps.workers import make_worker
 from support.waiting import FAR
 
@@ -178,17 +178,17 @@ def test_runs_with_several_rates_gates_and_computed_starts_are_single_runs_to_th
 
 
 def test_a_worker_binds_a_diagram_once_for_parameters_that_are_numbers(monkeypatch):
-    from loopwright.diagrams.sweeps import plan
+    from loopwright.diagrams.sweeps import worker as _worker
 
     made = []
 
-    class Counted(plan.BoundRun):
+    class Counted(_worker.BoundRun):
         def __init__(self, *arguments):
             made.append(self)
             super().__init__(*arguments)
 
-    monkeypatch.setattr(plan, "BoundRun", Counted)
-    monkeypatch.setattr(plan, "simulate", lambda *_, **__: pytest.fail("a run of its own"))
+    monkeypatch.setattr(_worker, "BoundRun", Counted)
+    monkeypatch.setattr(_worker, "simulate", lambda *_, **__: pytest.fail("a run of its own"))
     found = many_rates().sweep({"start.factor": np.linspace(1.0, 2.0, 9)}, 0.1, signals="start.y", workers=1, **QUIET)
     assert len(made) == 1
     np.testing.assert_array_equal(found["start.y"][:, 0], 0.25 * np.linspace(1.0, 2.0, 9))  # each has its own start

@@ -16,7 +16,8 @@ from loopwright.diagrams import experiments
 from loopwright.diagrams.sweeps import Sample, final
 from loopwright.diagrams.sweeps.cluster import Parcel
 from loopwright.diagrams.sweeps.lane_worker import DIFFER
-from loopwright.diagrams.sweeps.plan import Plan, Worker
+from loopwright.diagrams.sweeps.plan import Plan
+from loopwright.diagrams.sweeps.worker import Worker
 from loopwright.fmus import Fmu, gantry
 from support.lanes import noisy
 from support.swept import double_end, fragile

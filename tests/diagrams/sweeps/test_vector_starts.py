@@ -18,8 +18,8 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps.lane_worker import DIFFER
+from loopwright.diagrams.sweeps.plan import make_plan
 from loopwright.diagrams.sweeps.samples import Sample
-from loopwright.diagrams.sweeps.sweep import make_plan
 from loopwright.diagrams.sweeps.workers import make_worker
 from loopwright.fmus import Fmu
 from loopwright.fmus.models import mass_spring_damper
