@@ -3,7 +3,6 @@
 from .background import BackgroundCode
 from .bound_functions import bind_call
 from .compiled_libraries import load_compiled
-from .compiled_loop import CompiledLoop, Outcome, ReturnReason
 from .diagram_code import (
     DiagramCode,
     code_sources,
@@ -14,27 +13,28 @@ from .diagram_code import (
     write_code,
 )
 from .event_domains import Domains
+from .events_in_c import Fired, Pile
 from .expanded_functions import LARGEST
 from .exported_memory import NamedCode, function_text, read_memory
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
-from .handed_over import HandedOver
-from .hybrid import (
+from .integration_methods import MethodOptions
+from .kernels import Kernel
+from .library_method import StepFailure
+from .loop_over_ticks import CompiledLoop, Outcome, ReturnReason
+from .loop_over_time import (
     BrokenOff,
     CompiledHybrid,
     Lost,
     Sign,
     Span,
 )
-from .integration_methods import MethodOptions
-from .kernels import Kernel
-from .library_method import StepFailure
+from .model_exchange_hand_over import HandedOver
+from .model_exchange_in_c import NativeModelExchange, OwnEvent
 from .newton import NewtonOptions
 from .plants_called_back import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
 from .runtime import load_runtime
-from .staged import NativeModelExchange, OwnEvent
 from .transport_delays import Delays, delays_of
-from .watch import Fired, Pile
 
 __all__ = [
     "LARGEST",

@@ -49,7 +49,7 @@ class BoundFunction:
 
 
 BlockBinder = Callable[..., Any]
-"""``bind_block(stage, t, c, again=…)`` returns a block between traced stages as C knows it: see `staged`."""
+"""``bind_block(stage, t, c, again=…)`` returns a block between traced stages, see `model_exchange_in_c`."""
 
 
 @dataclass(frozen=True, eq=False)

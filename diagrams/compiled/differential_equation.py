@@ -10,12 +10,12 @@ import numpy as np
 
 from ..flat import NONE, FlatDiagram
 from .bound_functions import CompiledFunction, MemoryForC, at
-from .compiled_loop import CompiledLoop
 from .diagram_code import DiagramCode
 from .hybrid_structures import ProblemStructure
+from .loop_over_ticks import CompiledLoop
+from .model_exchange_in_c import NativeModelExchange
 from .newton import NewtonOptions, NewtonStructure
 from .rate_differences import SlopesByDifferences
-from .staged import NativeModelExchange
 from .transport_delays import Delays, NativeDelays
 
 

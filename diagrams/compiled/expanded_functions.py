@@ -16,7 +16,7 @@ from .generated_text import write_functions
 from .rate_differences import Columns, SlopesByDifferences
 from .reordered import put_in_order
 from .small_steps import STEPS, write_steps
-from .staged_functions import Staged
+from .staged import Staged
 
 _Clocks = frozenset[TickPattern]
 

@@ -16,10 +16,10 @@ import numpy as np
 from ...fmus.export import Field, LoopMemory, c_number
 from ..flat import share_terms
 from .bound_functions import BoundFunction, CodeOfFunctions, CompiledFunction, TickStructure
-from .compiled_loop import LoopStructure
+from .events_in_c import WatchStructure
 from .hybrid_structures import DelaysStructure, HybridStructure, MethodStructure, ProblemStructure
+from .loop_over_ticks import LoopStructure
 from .newton import NewtonStructure
-from .watch import WatchStructure
 
 _STRUCTS: dict[type[ctypes.Structure], str] = {
     TickStructure: "tick",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import ctypes
 
 from .bound_functions import TickStructure, fields_of
-from .compiled_loop import LoopStructure
-from .watch import WatchStructure
+from .events_in_c import WatchStructure
+from .loop_over_ticks import LoopStructure
 
 _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 

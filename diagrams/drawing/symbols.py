@@ -1,4 +1,4 @@
-"""What a drawing shows inside a block: its value, its transfer function, its characteristic, its waveform.
+"""Symbols inside the blocks of a drawing: a value, a transfer function, a characteristic, a waveform.
 
 A block of a user's own says it by the property ``drawn_inside``; " / " makes a fraction of it.
 """
@@ -120,6 +120,46 @@ def _symbol(block: Block) -> Symbol | None:
     return None
 
 
+# --- symbols that are the same for all blocks of a kind -------------------------------------------------------------
+
+_LOW, _HIGH = ((-1.0, -0.7), (-0.45, -0.7)), ((0.45, 0.7), (1.0, 0.7))
+_STAIRS = Symbol(
+    curve=tuple((x, 0.4 * i) for i in range(-2, 3) for x in (0.4 * i - 0.2, 0.4 * i + 0.2)),
+    axes=True,
+)
+_ZIGZAG = tuple((-1.0 + 0.1 * i, 0.85 * math.sin(7.3 * i * i + 1.1 * i)) for i in range(21))
+_HYSTERESIS = ((-1.0, -0.7), (0.35, -0.7), (0.35, 0.7), (1.0, 0.7), (-0.35, 0.7), (-0.35, -0.7))
+_FIXED: dict[type[Block], Symbol] = {
+    And: Symbol("∧"),
+    Or: Symbol("∨"),
+    Not: Symbol("¬"),
+    Minimum: Symbol("min"),
+    Maximum: Symbol("max"),
+    Product: Symbol("×"),
+    Clock: Symbol("t"),
+    Counter: Symbol("count"),
+    Latch: Symbol("S R"),
+    Hold: Symbol("hold"),
+    UnitDelay: Symbol("z⁻¹"),
+    FIR: Symbol("Σ bₖ z⁻ᵏ"),
+    IIR: Symbol("b(z)", "a(z)"),
+    StateSpace: Symbol("ẋ = A x + B u"),
+    DiscreteStateSpace: Symbol("x⁺ = A x + B u"),
+    Integrator: Symbol("1", "s"),
+    LimitedIntegrator: Symbol("1", "s"),
+    ResettableIntegrator: Symbol("1", "s"),
+    Quantizer: _STAIRS,
+    Encoder: _STAIRS,
+    Relay: Symbol(curve=_HYSTERESIS, axes=True),
+    Backlash: Symbol(curve=((-0.9, -0.7), (-0.3, -0.7), (0.9, 0.7), (0.3, 0.7), (-0.9, -0.7)), axes=True),
+    RateLimiter: Symbol(curve=((-1.0, -0.7), (-0.5, -0.7), (0.5, 0.7), (1.0, 0.7))),
+    Switch: Symbol(curve=((-1.0, 0.6), (-0.5, 0.6), (0.5, 0.0), (1.0, 0.0))),
+    EdgeDetector: Symbol(curve=((-1.0, -0.7), (0.0, -0.7), (0.0, 0.7), (1.0, 0.7))),
+    BandLimitedNoise: Symbol(curve=_ZIGZAG),
+}
+for _kind, _shown in _FIXED.items():
+    _symbol.register(_kind, lambda block, shown=_shown: shown)
+
 # --- numbers and polynomials ----------------------------------------------------------------------------------------
 
 
@@ -183,13 +223,6 @@ def _(block: Any) -> Symbol:
     return Symbol(_number(block.value))
 
 
-@_symbol.register(Integrator)
-@_symbol.register(LimitedIntegrator)
-@_symbol.register(ResettableIntegrator)
-def _(block: Any) -> Symbol:
-    return Symbol("1", "s")
-
-
 @_symbol.register(FilteredDerivative)
 def _(block: Any) -> Symbol:
     return Symbol("s", f"{_number(block.time_constant)} s + 1")
@@ -220,16 +253,6 @@ def _(block: Any) -> Symbol:
     return _factored(block, "z")
 
 
-@_symbol.register(StateSpace)
-def _(block: Any) -> Symbol:
-    return Symbol("ẋ = A x + B u")
-
-
-@_symbol.register(DiscreteStateSpace)
-def _(block: Any) -> Symbol:
-    return Symbol("x⁺ = A x + B u")
-
-
 @_symbol.register(DiscreteIntegrator)
 def _(block: Any) -> Symbol:
     above, below = {"forward": ("T", "z − 1"), "backward": ("T z", "z − 1")}.get(
@@ -238,24 +261,9 @@ def _(block: Any) -> Symbol:
     return Symbol(above if block.gain == 1 else f"{_number(block.gain)} {above}", below)
 
 
-@_symbol.register(FIR)
-def _(block: Any) -> Symbol:
-    return Symbol("Σ bₖ z⁻ᵏ")
-
-
-@_symbol.register(IIR)
-def _(block: Any) -> Symbol:
-    return Symbol("b(z)", "a(z)")
-
-
 @_symbol.register(MovingAverage)
 def _(block: Any) -> Symbol:
     return Symbol(f"mean of {block.samples}")
-
-
-@_symbol.register(UnitDelay)
-def _(block: Any) -> Symbol:
-    return Symbol("z⁻¹")
 
 
 @_symbol.register(Delay)
@@ -280,9 +288,6 @@ def _(block: Any) -> Symbol:
 
 
 # --- characteristics ------------------------------------------------------------------------------------------------
-
-_LOW, _HIGH = ((-1.0, -0.7), (-0.45, -0.7)), ((0.45, 0.7), (1.0, 0.7))
-_ZIGZAG = tuple((-1.0 + 0.1 * i, 0.85 * math.sin(7.3 * i * i + 1.1 * i)) for i in range(21))
 
 
 def _characteristic(function: Callable[[np.ndarray], np.ndarray], low: float, high: float) -> Symbol | None:
@@ -346,72 +351,12 @@ def _(block: Any) -> Symbol | None:
     return Symbol(curve=tuple(zip(x[::step].tolist(), y[::step].tolist(), strict=True)))
 
 
-@_symbol.register(Quantizer)
-@_symbol.register(Encoder)
-def _(block: Any) -> Symbol:
-    stairs = [(x, y) for i in range(-2, 3) for x, y in ((0.4 * i - 0.2, 0.4 * i), (0.4 * i + 0.2, 0.4 * i))]
-    return Symbol(curve=tuple(stairs), axes=True)
-
-
-@_symbol.register(Relay)
-def _(block: Any) -> Symbol:
-    loop = ((-1.0, -0.7), (0.35, -0.7), (0.35, 0.7), (1.0, 0.7), (-0.35, 0.7), (-0.35, -0.7))
-    return Symbol(curve=loop, axes=True)
-
-
-@_symbol.register(Backlash)
-def _(block: Any) -> Symbol:
-    return Symbol(curve=((-0.9, -0.7), (-0.3, -0.7), (0.9, 0.7), (0.3, 0.7), (-0.9, -0.7)), axes=True)
-
-
-@_symbol.register(RateLimiter)
-def _(block: Any) -> Symbol:
-    return Symbol(curve=((-1.0, -0.7), (-0.5, -0.7), (0.5, 0.7), (1.0, 0.7)))
-
-
-# --- logic and functions --------------------------------------------------------------------------------------------
-
-_TEXTS: dict[type[Block], str] = {
-    And: "∧",
-    Or: "∨",
-    Not: "¬",
-    Minimum: "min",
-    Maximum: "max",
-    Product: "×",
-    Clock: "t",
-    Counter: "count",
-    Latch: "S R",
-    Hold: "hold",
-}
-
-
-@_symbol.register(And)
-@_symbol.register(Or)
-@_symbol.register(Not)
-@_symbol.register(Minimum)
-@_symbol.register(Maximum)
-@_symbol.register(Product)
-@_symbol.register(Clock)
-@_symbol.register(Counter)
-@_symbol.register(Latch)
-@_symbol.register(Hold)
-def _(block: Any) -> Symbol:
-    return Symbol(next(text for kind, text in _TEXTS.items() if isinstance(block, kind)))
+# --- comparisons and functions ----------------------------------------------------------------------------------------
 
 
 @_symbol.register(Compare)
 def _(block: Any) -> Symbol:
     return Symbol(block.relation.replace(">=", "≥").replace("<=", "≤"))
-
-
-@_symbol.register(Switch)
-def _(block: Any) -> Symbol:
-    return Symbol(curve=((-1.0, 0.6), (-0.5, 0.6), (0.5, 0.0), (1.0, 0.0)))
-
-
-@_symbol.register(EdgeDetector)
-def _(block: Any) -> Symbol:
-    return Symbol(curve=((-1.0, -0.7), (0.0, -0.7), (0.0, 0.7), (1.0, 0.7)))
 
 
 @_symbol.register(Function)
@@ -427,11 +372,6 @@ def _(block: Any) -> Symbol | None:
 
 
 # --- sources --------------------------------------------------------------------------------------------------------
-
-
-@_symbol.register(BandLimitedNoise)
-def _(block: Any) -> Symbol:
-    return Symbol(curve=_ZIGZAG)
 
 
 @_symbol.register(Source)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...fmus.export import c_number
 from ..compiled import Kernel, make_tables
 from ..flat import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, TickProgram
 from .scalar_calls import ScalarFunctions
@@ -145,12 +146,4 @@ class GroupedCode:
 
 
 def _list(values: np.ndarray) -> str:
-    if values.dtype == float:
-        texts = [value.hex() if np.isfinite(value) else _special(value) for value in values.tolist()]
-    else:
-        texts = [str(value) for value in values.tolist()]
-    return ", ".join(texts) or "0"
-
-
-def _special(value: float) -> str:
-    return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
+    return ", ".join(map(c_number, values.tolist())) or "0"

@@ -12,12 +12,12 @@ from ...blocks.core import CompilerError, FmuError
 from ...fmus import Fmu
 from ...fmus.export import describe_processor, processor_flags
 from ..compiled import LARGEST, NewtonOptions, load_compiled
-from ..flat import NONE, TRUE, FlatDiagram, TickPattern
+from ..flat import NONE, TRUE, FlatDiagram, TickPattern, share_terms
 from ..solvers import FIXED
 from .flow_code import FlowSource, write_flow
 from .lane_loops import LoopSource, write_loops
 from .lane_plants import LanePlant, read_plant
-from .lane_ticks import TickSources, read_source, share
+from .lane_ticks import TickSources, read_source
 from .no_lanes import NoLanesError
 from .scalar_calls import ScalarFunctions
 from .start_code import StartSource, write_start
@@ -223,7 +223,7 @@ def _check_size(function: Any) -> Any:
             f"its rates, or the equations of its algebraic loops, have {operations} operations, and at most {LARGEST} "
             "are compiled as a whole"
         )
-    return share(function)
+    return share_terms(function)
 
 
 def _bind_starts(library: ctypes.CDLL, source: StartSource) -> LaneStarts:
@@ -256,9 +256,11 @@ def _between_ticks(flat: FlatDiagram, method: str) -> str:
     for path in flat.checked.traced if flat.continuous.size else ():
         if flat.table.blocks[path].memory and not flat.table.is_sampled(flat.table.subsystem_of[path]):
             return f"{path} keeps a memory between ticks"
-    delays = {flat.ports[name][0] for name in flat.plant_inputs.slices}
-    delays = {path for path in delays if flat.table.blocks[path].transport}
-    return f"{min(delays)} is a transport delay in continuous time" if delays else ""
+    if flat.has_delays:
+        owners = {flat.ports[name][0] for name in flat.plant_inputs.slices}
+        delay = min(path for path in owners if flat.table.blocks[path].transport)
+        return f"{delay} is a transport delay in continuous time"
+    return ""
 
 
 def _plant(flat: FlatDiagram, path: str) -> LanePlant:

@@ -6,6 +6,7 @@ import ctypes
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -138,22 +139,18 @@ def make_room(*shape: int) -> np.ndarray:
     return memory[begin : begin + count].view(float).reshape(shape)
 
 
-_STRUCTURES: dict[int, type[ctypes.Structure]] = {}
-
-
+@cache
 def _structure(count: int) -> type[ctypes.Structure]:
     """Return the structure that C knows, for some number of lanes."""
-    if count not in _STRUCTURES:
-        integer, pointer, lanes = ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64 * count
-        fields = [
-            *((name, integer) for name in ("every", "skip", "columns", "stops")),
-            *((name, pointer) for name in ("column", "stop", "p", "x", "w", "z", "plant", "steps", "last")),
-            *((name, lanes) for name in ("alive", "failed", "stopped", "by")),
-            *((name, integer) for name in ("ticks", "rows")),
-            ("room", pointer),
-        ]
-        _STRUCTURES[count] = type("LanesStructure", (ctypes.Structure,), {"_fields_": fields})
-    return _STRUCTURES[count]
+    integer, pointer, lanes = ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64 * count
+    fields = [
+        *((name, integer) for name in ("every", "skip", "columns", "stops")),
+        *((name, pointer) for name in ("column", "stop", "p", "x", "w", "z", "plant", "steps", "last")),
+        *((name, lanes) for name in ("alive", "failed", "stopped", "by")),
+        *((name, integer) for name in ("ticks", "rows")),
+        ("room", pointer),
+    ]
+    return type("LanesStructure", (ctypes.Structure,), {"_fields_": fields})
 
 
 def _aligned(values: np.ndarray) -> np.ndarray:

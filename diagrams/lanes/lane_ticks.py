@@ -6,10 +6,8 @@ from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
-import casadi as ca
-
 from ..compiled import LARGEST
-from ..flat import FlatDiagram, TickPattern
+from ..flat import FlatDiagram, TickPattern, share_terms
 from .grouped_code import GroupedCode
 from .scalar_calls import ScalarFunctions
 from .vector_code import VectorCode, write_vectors
@@ -45,12 +43,6 @@ def read_source(name: str) -> str:
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
-def share(function: Any) -> Any:
-    """Return a function of scalar operations in which each of them is done once."""
-    symbols = function.sx_in()
-    return ca.Function(function.name(), symbols, ca.cse(function.call(symbols)))
-
-
 def _find_straight(
     flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]]
 ) -> dict[frozenset[TickPattern], Any] | None:
@@ -60,4 +52,4 @@ def _find_straight(
         return None
     if sum(tick.n_instructions() for tick in ticks.values()) > LARGEST:
         return None
-    return {clocks: share(tick) for clocks, tick in ticks.items()}
+    return {clocks: share_terms(tick) for clocks, tick in ticks.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import casadi as ca
 
 from ...blocks.tracing import MATH_FUNCTIONS, count_uses
+from ...fmus.export import c_number
 from .no_lanes import NoLanesError
 
 _INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
@@ -86,7 +86,7 @@ class _Writer:
                 work[out[0]] = _Value(f"{self._arguments[place[0]]}[{place[1]}]", place[0] in self._fixed)
             elif op == ca.OP_CONST:
                 value = f.instruction_constant(k)
-                work[out[0]] = _Value(f"splat({_number(value)})", True, constant=value)
+                work[out[0]] = _Value(f"splat({c_number(value)})", True, constant=value)
             elif op == ca.OP_ASSIGN:
                 work[out[0]] = work[operands[0]]
             else:
@@ -168,11 +168,3 @@ class _Writer:
         if value.mask:
             return value
         return self._new(f"{self._use(value, value.fixed)} != 0.0", value.fixed, mask=True)
-
-
-def _number(value: float) -> str:
-    if math.isnan(value):
-        return "NAN"
-    if math.isinf(value):
-        return "INFINITY" if value > 0 else "-INFINITY"
-    return value.hex()

@@ -12,7 +12,7 @@ import numpy as np
 from ..flat import FlatDiagram
 from .bound_functions import FunctionInC, MemoryForC, TickStructure, fields_of
 from .event_domains import Domains
-from .staged import NativeModelExchange
+from .model_exchange_in_c import NativeModelExchange
 
 _LOGGED = 2**22  # bytes of what has fired in a call
 _INSTANTS = 1100  # of a step that are looked at together, at most
@@ -108,7 +108,8 @@ class Watch:
         for name, vectors in {"z": z, "open": opened, "fired": fired}.items():
             self._put(name, vectors)
         self.structure.indicators = memory.bind(functions["indicators"], trial, [z, opened], bind_block)
-        if exchange is None:  # blocks in model exchange look at every instant: their jumps are theirs, see `hybrid`
+        # Blocks in model exchange look at every instant; `loop_over_time` binds the jumps of a diagram with some.
+        if exchange is None:
             self.structure.jump = memory.bind(functions["jump"], [*here, fired], [x_next])
         self.fired = fired
         """Which events fire in a jump, from 0 to 1."""

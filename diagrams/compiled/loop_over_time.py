@@ -1,4 +1,4 @@
-"""The compiled loop with continuous states: a method of integration, events and ticks, gone through in C."""
+"""The loop over time in C: a method of integration, events and ticks, bound to the numbers of a run."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ import numpy as np
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, MethodKind
 from .bound_functions import CALL, MemoryForC, at
-from .compiled_loop import CompiledLoop, Outcome, OutcomeStructure
 from .diagram_code import DiagramCode
 from .differential_equation import DifferentialEquation
 from .event_domains import Domains
+from .events_in_c import Fired, Pile, Watch
 from .hybrid_structures import HybridStructure, SpanStructure
 from .integration_methods import IntegrationMethod, MethodOptions
 from .library_method import StepFailure
+from .loop_over_ticks import CompiledLoop, Outcome, OutcomeStructure
+from .model_exchange_in_c import NativeModelExchange
 from .newton import NewtonOptions
 from .runtime import load_runtime
-from .staged import NativeModelExchange
 from .transport_delays import Delays
-from .watch import Fired, Pile, Watch
 
 _SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn
 _LIBRARY_STEP = 200_000  # ns that a library takes for a step, about

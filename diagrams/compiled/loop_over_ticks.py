@@ -1,4 +1,4 @@
-"""The compiled loop: a diagram's ticks and the FMUs between them, gone through in C."""
+"""The loop over ticks in C: a diagram's ticks and the FMUs between them, bound to the numbers of a run."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from ..flat import TRUE, StepTable, TickPattern
 from .bound_functions import CALL, TICK, MemoryForC, TickStructure, at
 from .diagram_code import DiagramCode
 from .grouped_functions import GroupedTick
+from .model_exchange_in_c import NativeModelExchange
 from .newton import NewtonOptions, NewtonStructure
 from .plants_called_back import PythonStep, RemotePlants
 from .rate_differences import SlopesByDifferences
 from .runtime import load_runtime
-from .staged import NativeModelExchange
 
 _SEEN = 1e-6  # least singular value, relative to 1 + the loop's gain, that differences surely tell from 0
 

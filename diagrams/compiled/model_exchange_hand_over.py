@@ -11,7 +11,7 @@ from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError
 from ...fmus.calls import WARNING, ModelExchangeInstance
 from ..flat import JUMP, FlatDiagram, OpaqueStage
 from ..model_exchange import OWN_EVENTS, ModelExchangeEvaluator
-from .staged import NativeModelExchange, OwnEvent
+from .model_exchange_in_c import NativeModelExchange, OwnEvent
 
 _DONE, _NOT_COMPUTED = range(2)
 _FIRED = -1
