@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from .coupling_options import Coupling, Scheme
 from .links import Links
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant
-from .rest import Rest
 from .rollback import Beginning, Rollback, accept_steps, find_taken_back, save_plant, texts_of, try_steps
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 4.0
@@ -36,6 +35,25 @@ class Effort:
     """Shortest communication step in s."""
 
 
+class ContinuousRest(Protocol):
+    """The blocks in continuous time, which take part in a communication step of the plants.
+
+    A protocol: the loop over time, above this sub-package, gives them to a coupling scheme.
+    """
+
+    def advance(self, t: float, end: float) -> float | None:
+        """Go from t to the end, with the plants' outputs as they are in w; return where a stop condition ended it."""
+
+    def save(self) -> Any:
+        """Return the present state, for `restore`."""
+
+    def restore(self, saved: Any) -> None:
+        """Go back to a state."""
+
+    def accept(self) -> None:
+        """Keep the events that have happened since the last call."""
+
+
 class CoupledSteps:
     """Communication steps of all plants of a run, by a scheme other than the default."""
 
@@ -49,7 +67,7 @@ class CoupledSteps:
         z: np.ndarray,
         w: np.ndarray,
         exchange: Callable[[float], np.ndarray],  # gives the inputs that follow from w at a time in s, between ticks
-        rest: Rest,
+        rest: ContinuousRest,
     ) -> None:
         self._flat, self._name, self._plants, self.coupling = flat, name, plants, coupling
         self._z, self._w, self._exchange, self._rest = z, w, exchange, rest

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
@@ -62,15 +62,6 @@ class Plant(Protocol):
         """Go to a state, and write the outputs there."""
 
 
-class Stepped(Protocol):
-    """A block whose class says ``stepped = True``: an `Fmu`, or one that a user has written."""
-
-    def instantiate(
-        self, wired: Sequence[str], stop_time: float | None, *, start_time: float
-    ) -> AbstractContextManager[Plant]:
-        """Load the plant for a run; see `loopwright.Block`."""
-
-
 def note_steps(flat: FlatDiagram, *, step: object) -> tuple[str, ...]:
     """Return messages on the communication steps of plants; ``step`` is that which the run was asked for, or None."""
     known = _KNOWN.setdefault(flat, {})
@@ -121,11 +112,11 @@ def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) ->
     """Yield the plants by path, each as soon as it is loaded; ``stack`` unloads them."""
     # No end of the run is passed: it may be continued, and an FMU may keep to the end that it was given.
     for path, block in stepped_blocks(flat.table).items():
-        made: Any = block
-        stepped: Stepped = made
+        stepped: Any = block  # an `Fmu`, or a block of a user's; see `loopwright.Block` for ``instantiate``
         try:
             wired = [port for of, port in map(flat.ports.__getitem__, flat.plant_inputs.slices) if of == path]
-            yield path, stack.enter_context(stepped.instantiate(wired, None, start_time=start_time))
+            plant: Plant = stack.enter_context(stepped.instantiate(wired, None, start_time=start_time))
+            yield path, plant
         except SimulationError as error:
             error.at(block=path, t=0.0)
             raise

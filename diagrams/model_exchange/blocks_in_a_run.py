@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core import FmuRuntimeError, LoopwrightError, SimulationError
 from ..flat import FlatDiagram
-from .evaluator import HasModelExchange, Look, ModelExchangeBlock, ModelExchangeEvaluator
+from .evaluator import Look, ModelExchangeBlock, ModelExchangeEvaluator
 
 _SETTLED = 1e-13  # relative change of a state between two passes at the start, a few hundred ulps
 
@@ -31,10 +31,9 @@ class BlocksInModelExchange:
     def load(self, stack: ExitStack, start_time: float) -> None:
         """Load the blocks for a run from a time in s on; ``stack`` unloads them."""
         for path, evaluator in self.evaluators.items():
-            made: Any = self.flat.table.blocks[path]
-            block: HasModelExchange = made
+            block: Any = self.flat.table.blocks[path]  # an `Fmu`, or one of a user's; see `loopwright.Block`
             try:
-                wired = [port for port in made.inputs if (path, port) in self.flat.table.wires]
+                wired = [port for port in block.inputs if (path, port) in self.flat.table.wires]
                 self.blocks[path] = stack.enter_context(block.exchange(wired, start_time=start_time))
                 evaluator.load(self.blocks[path])
             except SimulationError as error:

@@ -1,6 +1,6 @@
 """A block that is in model exchange in a run, such as an FMU, and its evaluator.
 
-An `ModelExchangeBlock` is loaded for a run, as a plant is. An `ModelExchangeEvaluator` lets the stages of the diagram's
+A `ModelExchangeBlock` is loaded for a run, as a plant is. A `ModelExchangeEvaluator` lets the stages of the diagram's
 functions call it; it is there before the block is loaded, as the functions are bound first.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from enum import Enum
 from typing import Any, Protocol
 
@@ -100,13 +99,6 @@ class ModelExchangeBlock(Protocol):
 
     def restore_bytes(self, data: bytes) -> None:
         """Go to the state of such bytes."""
-
-
-class HasModelExchange(Protocol):
-    """A block whose class says ``in_model_exchange``: an `Fmu`, or one that a user has written."""
-
-    def exchange(self, wired: Sequence[str], *, start_time: float) -> AbstractContextManager[ModelExchangeBlock]:
-        """Load it for a run; see `loopwright.Block`."""
 
 
 OWN_EVENTS = INPUT_EVENT, TIME_EVENT, STEP_EVENT = "input_event", "time_event", "step_event"

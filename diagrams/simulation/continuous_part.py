@@ -26,7 +26,7 @@ class _Saved:
 
 
 class ContinuousPart:
-    """The blocks in continuous time between two ticks: advanced, saved and restored; see `Rest`."""
+    """The blocks in continuous time between two ticks: advanced, saved and restored; see `ContinuousRest`."""
 
     def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: BlocksInModelExchange):
         self._workspace, self._continuous, self._exchanged = workspace, continuous, exchanged
@@ -68,7 +68,7 @@ class ContinuousPart:
             self._continuous.restore(saved.continuous)
 
     def accept(self) -> None:
-        """Tell the events that have happened, and raise the error of an input that was out of its range."""
+        """Report the events that have happened, and raise the error of an input that was out of its range."""
         accept_steps(self._exchanged.blocks.values())
         if self._events:
             for event in self._events:

@@ -15,45 +15,31 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .base import AcceptedStep, Polynomial, Problem, Solver
 from .dense_output import from_differences, from_nordsieck
 
+if TYPE_CHECKING:
+    from scipy.integrate import OdeSolver
+
 _DENSE = {"BDF": from_differences, "LSODA": from_nordsieck}
 _RETRIES = 30  # of one step; of steps in a row each counts 3, and a step at once gives 1 back
-
-
-class _Method(Protocol):
-    """The part of SciPy's solver objects that is used here."""
-
-    t: float
-    t_old: float | None
-    y: np.ndarray
-    h_abs: float
-    atol: float | np.ndarray
-    status: str
-
-    def step(self) -> str | None:
-        """Take a step."""
-
-    def dense_output(self) -> Any:
-        """Return the interpolant of the last step."""
 
 
 class SciPySolver(Solver):
     """One of `scipy.integrate`'s multistep methods, given the exact Jacobian; a restart begins at order 1 again."""
 
-    _inner: _Method
+    _inner: OdeSolver
     stiff = True
 
     def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         import scipy.integrate
 
         super().__init__(name, problem, rtol, atol, max_step)
-        self._method: Callable[..., _Method] = getattr(scipy.integrate, name)
+        self._method: Callable[..., OdeSolver] = getattr(scipy.integrate, name)
         self._options: dict[str, object] = {"rtol": rtol, "atol": atol, "max_step": max_step}
         self._options["jac"] = self._usable_jacobian
         self._last_jacobian: np.ndarray | None = None
@@ -128,7 +114,7 @@ class SciPySolver(Solver):
             self.check_finite(t, super().rate(t, x), "rate")
         raise self.failure(t, x, 10 * math.ulp(t))
 
-    def _is_sound(self, inner: _Method) -> bool:
+    def _is_sound(self, inner: OdeSolver) -> bool:
         """Return whether an accepted step is finite: a method may have met a NaN on the way and shortened its step."""
         if self.name == "LSODA":  # it accepts a NaN
             return not self._strange
