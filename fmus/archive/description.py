@@ -31,6 +31,7 @@ from ..host_state import FOLDER
 from .aliases import find_aliases
 from .archive_limits import ArchiveLimits
 from .binaries import find_binary, judge_name
+from .capabilities import derivatives_flag, has_flag, read_capabilities, state_flags
 from .faults import FmuFault, FmuFinding
 from .feedthrough import Dependencies, read_dependencies
 from .fmpy_description import read_model
@@ -273,13 +274,12 @@ class FmuDescription(ShownAsTable):
     @property
     def derivatives_flag(self) -> str:
         """Name of the capability flag of directional derivatives."""
-        return "providesDirectionalDerivative" if self.fmi.startswith("2.") else "providesDirectionalDerivatives"
+        return derivatives_flag(self.fmi)
 
     @property
     def state_flags(self) -> tuple[str, str]:
         """Names of the capability flags of saving and of serializing the state."""
-        state = "FMUstate" if self.fmi.startswith("2.") else "FMUState"
-        return f"canGetAndSet{state}", f"canSerialize{state}"
+        return state_flags(self.fmi)
 
     @property
     def discrete_states(self) -> tuple[str, ...]:
@@ -421,7 +421,7 @@ def _read(
 def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dict[str, Any]:
     """Return the variables, states and capabilities of an FMU, as arguments of its description."""
     version = model.fmiVersion
-    flags = _capabilities(root, version)
+    flags = _read_co_simulation(root, version)
     if model.modelExchange is not None:
         with suppress(FmuFileError):  # without a library for this platform it is as good as none
             binary = find_binary(path, entries, version, model.modelExchange.modelIdentifier)
@@ -464,21 +464,17 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
     }
 
 
-def _capabilities(root: Any, version: str) -> dict[str, Any]:
-    """Return the flags of co-simulation (FMI 2.0, 4.3.1; FMI 3.0, 4.4), some of which FMPy drops."""
+def _read_co_simulation(root: Any, version: str) -> dict[str, Any]:
+    """Return the capabilities of co-simulation (FMI 2.0, 4.3.1; FMI 3.0, 4.4), some of which FMPy drops."""
     steps = root.find("Implementation//Capabilities" if version == "1.0" else "CoSimulation")
     two = not version.startswith("3.")
-    state = "FMUstate" if two else "FMUState"
     fixed = None if steps is None or two else steps.get("fixedInternalStepSize")
     experiment = root.find("DefaultExperiment")
     return {
-        "can_save": _flag(steps, f"canGetAndSet{state}"),
-        "can_serialize": _flag(steps, f"canGetAndSet{state}") and _flag(steps, f"canSerialize{state}"),
-        "has_derivatives": _flag(steps, "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"),
-        "only_once": _flag(steps, "canBeInstantiatedOnlyOncePerProcess"),
-        "has_event_mode": _flag(steps, "hasEventMode"),
-        "interpolates_inputs": _flag(steps, "canInterpolateInputs" if two else "providesIntermediateUpdate"),
-        "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
+        **read_capabilities(steps, version),
+        "has_event_mode": has_flag(steps, "hasEventMode"),
+        "interpolates_inputs": has_flag(steps, "canInterpolateInputs" if two else "providesIntermediateUpdate"),
+        "variable_step": has_flag(steps, "canHandleVariableCommunicationStepSize"),
         "fixed_internal_step": None if fixed is None else float(fixed),
         "stop_time": None if experiment is None else _number(experiment.get("stopTime")),
         "step_size": None if experiment is None else _number(experiment.get("stepSize")),
@@ -490,10 +486,6 @@ def _number(text: str | None) -> float | None:
         return None if text is None else float(text)
     except ValueError:
         return None
-
-
-def _flag(interface: Any, name: str) -> bool:
-    return interface is not None and interface.get(name) in ("true", "1")
 
 
 def _dropped_attributes(root: Any) -> dict[str, Mapping[str, str]]:

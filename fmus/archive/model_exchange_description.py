@@ -9,6 +9,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from .capabilities import has_flag, read_capabilities
 from .feedthrough import Dependencies, Key, key_of, read_dependencies
 from .variables import FmuVariable
 
@@ -71,21 +72,12 @@ def read_model_exchange(root: ET.Element, model: Any, binary: str) -> ModelExcha
     two = not model.fmiVersion.startswith("3.")
     given = root if model.fmiVersion.startswith("1.") else root.find("ModelExchange")
     assert given is not None
-    state = "FMUstate" if two else "FMUState"
-    derivative = "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"
-
-    def flag(name: str) -> bool:
-        return given.get(name) in ("true", "1")
-
-    completes = not flag("completedIntegratorStepNotNeeded") if two else flag("needsCompletedIntegratorStep")
+    unneeded, needed = "completedIntegratorStepNotNeeded", "needsCompletedIntegratorStep"
     return ModelExchangeInfo(
         identifier=given.get("modelIdentifier", ""),
         binary=binary,
-        can_save=flag(f"canGetAndSet{state}"),
-        can_serialize=flag(f"canGetAndSet{state}") and flag(f"canSerialize{state}"),
-        has_derivatives=flag(derivative),
-        only_once=flag("canBeInstantiatedOnlyOncePerProcess"),
-        completes_steps=completes,
+        **read_capabilities(given, model.fmiVersion),
+        completes_steps=not has_flag(given, unneeded) if two else has_flag(given, needed),
         state_count=int(model.numberOfContinuousStates),
         indicators=_indicators(model),
         time=next((key_of(v) for v in model.modelVariables if v.causality == "independent"), None),
