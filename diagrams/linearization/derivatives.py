@@ -73,7 +73,6 @@ class LocalDerivatives:
         self._made: dict[tuple[str, frozenset[TickPattern]], Any] = {}
         taps = [tuple((tap.port, tap.entries) for tap in group) for group in (inputs, outputs, openings)]
         self._taps: tuple[Any, ...] = tuple(taps)
-        self._workspace = Workspace(flat, evaluators) if flat.loops.slices else None
 
     @classmethod
     def at(
@@ -89,9 +88,14 @@ class LocalDerivatives:
         return cls(flat, inputs, outputs, openings, evaluators_at(flat, at), replace_stairs(flat, at, stairs))
 
     @cached_property
+    def workspace(self) -> Workspace | None:
+        """The workspace in which algebraic loops are solved; None without loops."""
+        return Workspace(self.flat, self.evaluators) if self.flat.loops.slices else None
+
+    @cached_property
     def varies(self) -> bool:
         """Whether the flow between ticks depends on time, or on algebraic loops."""
-        return bool(self.flat.flow.depends("dx", "t").any()) or self._workspace is not None
+        return bool(self.flat.flow.depends("dx", "t").any()) or self.workspace is not None
 
     @cached_property
     def jumps_in_time(self) -> bool:
@@ -107,7 +111,7 @@ class LocalDerivatives:
             if not flat.table.is_sampled(flat.table.subsystem_of[path])
             and any("t" in d for d in trace.depends.values())
         }
-        return self._workspace is None and by_time <= known and flat.keep("jumps in time", does)
+        return self.workspace is None and by_time <= known and flat.keep("jumps in time", does)
 
     def stays_until(self, t: float) -> float:
         """Return the time until which the flow between ticks does not depend on time from t on; t where it does."""
@@ -125,7 +129,7 @@ class LocalDerivatives:
         def is_constant() -> bool:
             return made.is_constant("dx", "t") and made.is_constant("dx", "x", continuous)
 
-        return self._workspace is None and self._kept("linear", NONE, is_constant)
+        return self.workspace is None and self._kept("linear", NONE, is_constant)
 
     @cached_property
     def has_constant_slopes(self) -> bool:
@@ -136,7 +140,7 @@ class LocalDerivatives:
             every = [made.is_constant(result, "t") and made.is_constant(result, "w") for result in ("dx", "z")]
             return all(every) and all(made.is_constant(result, "x", places) for result in ("dx", "z"))
 
-        return self._workspace is None and self._kept("constant", NONE, is_constant)
+        return self.workspace is None and self._kept("constant", NONE, is_constant)
 
     def _kept(self, name: str, acting: frozenset[TickPattern], make: Callable[[], T]) -> T:
         """Return a function of these taps, made once for all diagrams with the same functions.
@@ -262,7 +266,7 @@ class LocalDerivatives:
 
     def _solve_loops(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant."""
-        return x if self._workspace is None else self._workspace.solve_loops(acting, t, x, w)
+        return x if self.workspace is None else self.workspace.solve_loops(acting, t, x, w)
 
     def differentiate(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> Numbers:
         """Return the values x⁺ ("x"), z, y and dx at an instant, and their derivatives by x, w and d.

@@ -55,6 +55,7 @@ class DerivativesAlong(LocalDerivatives):
     def __init__(self, still: LocalDerivatives, direction: Direction, known: KnownModels):
         super().__init__(still.flat, still.inputs, still.outputs, still.openings, still.evaluators, still.stairs)
         self.direction, self._known = direction, known
+        self.workspace = still.workspace
         self.error = 0.0
         """Largest estimated error of a slope that is made of differences, so far."""
 
