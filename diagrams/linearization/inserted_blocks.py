@@ -1,17 +1,7 @@
 """Blocks inserted ahead of inputs, which pass the signal on: places of a linear model that no port has.
 
 An input port becomes a place of injection, of measurement or of a cut in this way, and a wire can be cut at some of its
-consumers only.
-
-A cut behind a port changes the signal of all its consumers. Three kinds of inputs deserve a word then:
-
-- *Tracking.* An input with ``tracks``, such as `PID.actual`, gets the true value of its own block's output, for
-  anti-windup or bumpless transfer. In the closed loop it follows that output. A cut between the two separates them: L
-  then contains the controller's own correction, which the running loop never makes.
-- *Ways of the controller itself.* A model in it that the wire feeds, too (`shared_wires`).
-- *Inert inputs.* At the operating point nothing follows from them, as from a saturation's excess within the limits.
-
-The loop to one consumer is cut at an inserted block that passes the signal on.
+consumers only: the loop to one consumer is cut at an inserted block.
 """
 
 from __future__ import annotations
@@ -25,7 +15,6 @@ import numpy as np
 from ...blocks.core import (
     Array,
     Block,
-    Finding,
     Input,
     OptionError,
     Output,
@@ -37,12 +26,8 @@ from ...blocks.core import (
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, layout_of
 from ..wiring import Structure, Wire, join
-from .block_slopes import slopes_of
-from .kinks import read_arguments, read_log
-from .left_out_effects import BlockFinding, CutFromTracking, InertConsumer
+from .kinks import read_log
 from .operating_points import PointLike, copy_point
-from .shared_wires import find_shared_cuts
-from .signal_paths import PathNode, SignalPaths
 from .taps import find_signal, wire_entries
 
 Port = tuple[str, str]
@@ -210,9 +195,10 @@ def find_inputs(diagram: WiredDiagram, flat: FlatDiagram, wire: str, to: Iterabl
     for block, port in inputs:
         source = table.wires[block, port]
         if (source.block, source.port) != signal.port or wire_entries(flat, source) != signal.entries:
+            fed_by_it = ", ".join(join(*c) for c in consumers_of(table.wires, signal.port)) or "it has none"
             raise WiringError(
                 f"found {source} wired to it; expected {wire!r}. Name the wire that feeds this input, or one of "
-                f"its consumers: {', '.join(join(*c) for c in _consumers(table.wires, signal.port)) or 'it has none'}.",
+                f"its consumers: {fed_by_it}.",
                 block=block,
                 port=port,
             )
@@ -232,76 +218,9 @@ def _find_input(diagram: WiredDiagram, name: str, fed: Sequence[Port]) -> Port:
     return known[found[0]]
 
 
-def _consumers(wires: dict[Port, Wire], port: Port) -> list[Port]:
+def consumers_of(wires: dict[Port, Wire], port: Port) -> list[Port]:
+    """Return the inputs that a port feeds, by path."""
     return sorted(to for to, wire in wires.items() if (wire.block, wire.port) == port)
-
-
-def find_cut_findings(
-    flat: FlatDiagram, at: OperatingPoint, cut: Sequence[Port], reported: Sequence[Finding]
-) -> tuple[Finding, ...]:
-    """Return the findings about inputs that a cut wire also feeds; those that are ``reported`` already are left out."""
-    ways = SignalPaths(flat, cut)
-    after, before = ways.after(cut), ways.before(cut)
-    on_loop = {
-        (n.block, n.port)
-        for n in after
-        if not n.is_output and any(PathNode(n.block, p, True) in before for p in flat.table.blocks[n.block].outputs)
-    }
-    known = {(f.block, f.source) for f in reported if isinstance(f, BlockFinding)}
-    inert = _find_inert(flat, at, cut, on_loop - known)
-    tracking = _find_tracking(flat, ways, cut, on_loop, before)
-    return (*tracking, *find_shared_cuts(flat, cut, lambda port: _name_of(flat, port)), *inert)
-
-
-def _find_tracking(
-    flat: FlatDiagram, ways: SignalPaths, cut: Sequence[Port], on_loop: set[Port], before: set[PathNode]
-) -> tuple[Finding, ...]:
-    table, found = flat.table, list[Finding]()
-    for path, port in sorted(on_loop):
-        tracked = table.blocks[path].inputs[port].tracks
-        if tracked is None or PathNode(path, tracked, True) not in before:
-            continue
-        if PathNode(path, port, False) in ways.follow((path, tracked)):
-            continue  # it follows its output with the cut as well
-        source = table.wires[path, port]
-        others = [
-            join(*c)
-            for c in _consumers(table.wires, (source.block, source.port))
-            if c in on_loop and table.blocks[c[0]].inputs[c[1]].tracks is None
-        ]
-        at = ", ".join(_name_of(flat, c) for c in cut)
-        found.append(
-            CutFromTracking(at, path, port, tracked, _name_of(flat, (source.block, source.port)), tuple(others))
-        )
-    return tuple(found)
-
-
-def _find_inert(flat: FlatDiagram, at: OperatingPoint, cut: Sequence[Port], on_loop: set[Port]) -> tuple[Finding, ...]:
-    """Return the consumers of a cut wire on the loop from which nothing follows at the operating point."""
-    found: list[Finding] = []
-    log: np.ndarray | None = None
-    for wire in dict.fromkeys(cut):
-        consumers = _consumers(flat.table.wires, wire)
-        for path, port in consumers:
-            if len(consumers) < 2 or (path, port) not in on_loop or path not in flat.checked.traced:
-                continue
-            if path in flat.in_model_exchange:
-                continue
-            slopes = slopes_of(flat.checked.traced[path])
-            if not slopes.rows.total:
-                continue
-            log = read_log(flat, at) if log is None else log
-            z, p = read_arguments(flat, at, path, slopes, log)
-            if not np.any(slopes.slopes(at.t, z, p)[1][:, slopes.columns.slices[f"u {port}"]]):
-                others = tuple(join(*c) for c in consumers if c in on_loop and c != (path, port))
-                found.append(InertConsumer(_name_of(flat, wire), path, port, others))
-    return tuple(found)
-
-
-def _name_of(flat: FlatDiagram, port: Port) -> str:
-    """Return the name of the wire behind a port, its path without one."""
-    names = [n for n, w in flat.table.names.items() if (w.block, w.port) == port and w.index is None]
-    return min(names, key=len, default=join(*port))
 
 
 # --- wires that are cut by a name ------------------------------------------------------------------------------------

@@ -52,12 +52,13 @@ from ..frequency import (
 )
 from ..results import OperatingPoint
 from ..wiring import exact_time
+from .cut_findings import find_cut_findings
 from .delay_channels import blocks_around
 from .derivatives import LocalDerivatives, find_moving
 from .exchanged import derivations_at, findings_on
 from .flow_model import LinearDelays, Model, approximate_delays, model_continuous, relative_error
 from .free_motions import FreeMotions, find_free_motions
-from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
+from .inserted_blocks import name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .left_out_effects import EntryTaken
 from .mean_stairs import A_TREATMENT
