@@ -41,13 +41,14 @@ from .operating_points import (
     refine_ticks,
     run_to,
 )
-from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks_to_renewal
+from .over_a_period import TickModel, model_ticks
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant, rational_loop
 from .plant_models import EQUILIBRIUM, PlantEquations, linearize_plant
 from .shared_wires import find_ways_back
 from .signal_paths import SignalPaths
 from .taps import Tap, find_signal, wire_entries
 from .trim_search import point_from_states, trim
+from .wire_renewals import ticks_between_renewals, ticks_to_renewal
 
 __all__ = [
     "EQUILIBRIUM",

@@ -17,12 +17,12 @@ period is that of the others.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, OptionError, PeriodicLoopError
+from ...blocks.core import ConfirmationError, Finding, PeriodicLoopError
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..frequency import FourMatrices
 from ..results import OperatingPoint
@@ -32,6 +32,7 @@ from .left_out_effects import MemoryActs
 from .plant_models import EQUILIBRIUM
 from .taps import Tap, find_signal
 from .tick_chain import Chain, period_of
+from .wire_renewals import clock_of, find_slower_clocks, group_by_renewals, ticks_to_renewal
 
 SAME_ROWS = 1e-12
 """Relative difference up to which a wire counts as unchanged from one tick to the next."""
@@ -179,81 +180,6 @@ def _find_memory(flat: FlatDiagram, A: np.ndarray, names: list[str]) -> tuple[li
 # --- loops -----------------------------------------------------------------------------------------------------------
 
 
-def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: int) -> int:
-    """Return the number of ticks after ``tick`` until the wires are renewed; 0 if they are not renewed together.
-
-    A wire is renewed at the ticks of the clock behind its source. A wire that follows continuous states or an FMU is
-    renewed at the ticks of the clock of its readers.
-    """
-    clock = _find_one_clock(flat, list(ports))
-    return 0 if clock is None or clock.acts(tick) else clock.after(tick) - tick
-
-
-def ticks_between_renewals(flat: FlatDiagram, ports: Iterable[tuple[str, str]]) -> int | None:
-    """Return the number of ticks from one renewal of the wires to the next; None if they are not renewed together."""
-    clock = _find_one_clock(flat, list(ports))
-    return None if clock is None else clock.every
-
-
-def find_slower_clocks(flat: FlatDiagram, ports: Iterable[tuple[str, str]], name: str) -> frozenset[TickPattern]:
-    """Return the clocks slower than the wires: than the fastest clock behind their sources, or their readers."""
-    ports = list(ports)
-    for reading in (False, True):
-        found = [_find_clocks(flat, port, reading=reading) for port in ports]
-        if all(found):
-            every = min(clock.every for clocks in found for clock in clocks or ())
-            return frozenset(clock for clock in flat.distinct if clock.every > every)
-    raise OptionError(
-        f"found no sampled subsystem that makes or reads {', '.join('.'.join(port) for port in ports)} alone; expected "
-        "one, whose rate says which loops are slower. Take the loop at a wire of a sampled subsystem.",
-        block=name,
-        port="slow",
-    )
-
-
-def _find_one_clock(flat: FlatDiagram, ports: Sequence[tuple[str, str]]) -> TickPattern | None:
-    """Return the one clock behind the sources of all wires, or else that of all their readers; None without one."""
-    for reading in (False, True):
-        found: set[TickPattern] | None = set()
-        for port in ports:
-            clocks = _find_clocks(flat, port, reading=reading)
-            found = None if clocks is None or found is None else found | clocks
-        if found is not None and len(found) == 1:
-            return next(iter(found))
-    return None
-
-
-def _find_clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[TickPattern] | None:
-    """Return the clocks behind a port, or with ``reading`` those of its readers.
-
-    Blocks in continuous time without states are passed through; with states, or an FMU, the result is None.
-    """
-    table = flat.table
-    found: set[TickPattern] = set()
-    todo, seen = [port[0]] if not reading else _readers(flat, port), set[str]()
-    while todo:
-        path = todo.pop()
-        if path in seen:
-            continue
-        seen.add(path)
-        subsystem = table.subsystem_of[path]
-        if table.is_sampled(subsystem) and subsystem in flat.clocks:
-            found.add(flat.clocks[subsystem])
-            continue
-        where = flat.states.slices.get(path)
-        if path not in flat.checked.traced or (where is not None and where.stop > where.start):
-            return None
-        if reading:
-            todo += [block for (block, _), w in table.wires.items() if w.block == path]
-        else:
-            todo += [w.block for (block, _), w in table.wires.items() if block == path]
-    return found
-
-
-def _readers(flat: FlatDiagram, port: tuple[str, str]) -> list[str]:
-    return [block for (block, _), w in flat.table.wires.items() if (w.block, w.port) == port]
-
-
 def begin_loop(
     closed: LocalDerivatives,
     at: OperatingPoint,
@@ -302,7 +228,7 @@ def model_loop(
         signal = next(s for s in local.inputs if labels[many[0]] in s.labels)
         raise _make_error(signal, len(groups[many[0]]), float(flat.base * period))
     if many:  # all renewals, so that a delay of one is a shift by one channel
-        renewals = _find_renewals(flat, local.inputs, [k for k, _ in chain.ticks])
+        renewals = group_by_renewals(flat, local.inputs, [k for k, _ in chain.ticks])
         groups = [renewals if renewals and len(group) > 1 else group for group in groups]
     chosen = [(e, j, group) for e in range(m) for j, group in enumerate(groups[e])]
     into = np.zeros((B.shape[1], len(chosen)))
@@ -329,20 +255,6 @@ def _make_error(signal: Tap, count: int, period: float) -> PeriodicLoopError:
         block=signal.port[0],
         port=signal.port[1],
     )
-
-
-def _find_renewals(flat: FlatDiagram, signals: Sequence[Tap], ticks: Sequence[int]) -> list[list[int]]:
-    """Return the groups of places in ``ticks`` between the renewals of the wires; empty if no one clock renews them."""
-    clock = _find_one_clock(flat, [signal.port for signal in signals])
-    if clock is None or not clock.acts(ticks[0]):
-        return []
-    groups: list[list[int]] = []
-    for place, k in enumerate(ticks):
-        if clock.acts(k):
-            groups.append([place])
-        else:
-            groups[-1].append(place)
-    return groups
 
 
 def _find_channels(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, m: int) -> list[list[list[int]]]:
@@ -446,7 +358,7 @@ def model_ticks(
     chain = Chain(local, at, None, period_of(flat))
     chain.go_on()
     keep = find_needed(chain.steps, own_states(flat, chain))
-    clocks = [_clock_of(flat, tap) for tap in injected]
+    clocks = [clock_of(flat, tap) for tap in injected]
     mine = flat.plant_ticks.get(path)
     found = tuple(
         TickModel(
@@ -459,9 +371,3 @@ def model_ticks(
     )
     labels = chain.labels
     return found, [labels[i] for i in keep]
-
-
-def _clock_of(flat: FlatDiagram, tap: Tap) -> TickPattern | None:
-    """Return the clock of the subsystem that a wire comes from; None of one in continuous time."""
-    subsystem = flat.table.subsystem_of.get(tap.port[0], "")
-    return flat.clocks.get(subsystem) if flat.table.is_sampled(subsystem) else None
