@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +27,9 @@ from .exercise import Bench, Exercise, kind_text, points
 from .runs import check_run
 from .traces import check_derivatives, check_feedthrough, check_guards, check_shapes, check_trace, find_swallowed
 from .value_rules import check_after_start, check_ports, check_purity, check_values, describe_units
+
+Pairs = frozenset[tuple[str, str]]
+"""Pairs (input, output)."""
 
 
 @explain_calls
@@ -56,9 +59,9 @@ class BlockReport:
     block: str
     kinds: Mapping[str, str]
     checks: Mapping[str, str]
-    feedthrough: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
-    unseen: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
-    swallowed: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
+    feedthrough: Mapping[str, Pairs] = field(default_factory=dict)
+    unseen: Mapping[str, Pairs] = field(default_factory=dict)
+    swallowed: Mapping[str, Pairs] = field(default_factory=dict)
     quiet: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -167,12 +170,12 @@ def check_block(
     span = exercise.duration if duration is None else float(duration)
     announced = find_instants(block, span)
     checks["next_instant"] = f"{len(announced)} within {span:g} s"
-    found = _Findings(exercise, announced, checks, span)
     wanted = _choose_kinds(kinds)
-    refused = [error for sampled in wanted if (error := found.check_in(sampled)) is not None]
+    parts = [_check_in(exercise, sampled, announced, span) for sampled in wanted]
+    refused = [error for _, error in parts if error is not None]
     if refused and (kinds or len(refused) == len(wanted)):
         raise refused[0]
-    return found.report()
+    return _gather(block.label, checks, [part for part, _ in parts])
 
 
 def _choose_kinds(kinds: Iterable[str]) -> list[bool]:
@@ -188,71 +191,68 @@ def _choose_kinds(kinds: Iterable[str]) -> list[bool]:
     return [sampled for sampled in (True, False) if not given or kind_text(sampled) in given]
 
 
-class _Findings:
-    """Findings about a block, for one kind of subsystem after the other."""
+def _check_in(
+    exercise: Exercise, sampled: bool, announced: list[float], duration: float
+) -> tuple[BlockReport, LoopwrightError | None]:
+    """Check the block in a subsystem of one kind; return the findings, and the error by which it refuses to be there."""
+    block, kind, checks = exercise.block, kind_text(sampled), dict[str, str]()
+    if block.transport or block.stepped:  # it has no equations
+        checks["run"], _ = check_run(exercise, sampled)
+        return _report(block, kind, checks), None
+    places = list(points(exercise, np.random.default_rng([exercise.seed, 20140]), 6))
+    equations = check_purity(exercise, sampled, places)
+    try:
+        traced = trace(block, exercise.shapes, sampled=sampled, cache={})
+    except (SampleTimeError, ShapeError) as error:
+        vector = any(exercise.shapes.values())
+        if isinstance(error, ShapeError) and (sampled or not block.events or not vector):
+            raise
+        return BlockReport(block.label, {kind: str(error)}, {}), error
+    bench = Bench(exercise, sampled, traced)
+    checks["purity"] = f"{equations} equations"
+    if hasattr(block, "after_start"):
+        checks["after_start"] = check_after_start(exercise, sampled, places, traced.states)
+    check_shapes(bench)
+    checks["trace"] = f"as NumPy to {check_trace(bench):.1e}, at {len(bench.points)} points"
+    checks["derivatives"] = f"as differences to {check_derivatives(bench):.1e}"
+    measured, unseen = check_feedthrough(bench)
+    pairs = frozenset(measured), frozenset(unseen), frozenset(find_swallowed(bench, measured))
+    checks["feedthrough"] = f"{len(measured)} pairs, {len(unseen)} more in the trace"
+    if guards := check_guards(bench):
+        checks["guards"] = str(guards)
+    quiet = set[str]()
+    if not sampled:
+        checks["smooth"] = f"{check_smooth(bench, announced, duration)} intervals"
+        count, quiet = check_events(bench)
+        if block.events:
+            checks["events"] = f"{count} fired in small steps"
+    checks["run"], fired = check_run(exercise, sampled)
+    return _report(block, kind, checks, pairs, quiet - fired), None
 
-    def __init__(self, exercise: Exercise, announced: list[float], checks: dict[str, str], duration: float):
-        self.exercise, self.announced, self.checks, self.duration = exercise, announced, checks, duration
-        self.kinds: dict[str, str] = {}
-        self.feedthrough: dict[str, frozenset[tuple[str, str]]] = {}
-        self.unseen: dict[str, frozenset[tuple[str, str]]] = {}
-        self.swallowed: dict[str, frozenset[tuple[str, str]]] = {}
-        self.quiet: set[str] = set()
 
-    def check_in(self, sampled: bool) -> LoopwrightError | None:
-        """Check the block in a subsystem of one kind; return the error with which it refuses to be there."""
-        exercise, kind, checks = self.exercise, kind_text(sampled), self.checks
-        block = exercise.block
-        if block.transport or block.stepped:
-            self.check_run_in(sampled)
-            return None
-        rng = np.random.default_rng([exercise.seed, 20140])
-        places = list(points(exercise, rng, 6))
-        equations = check_purity(exercise, sampled, places)
-        try:
-            traced = trace(block, exercise.shapes, sampled=sampled, cache={})
-        except (SampleTimeError, ShapeError) as error:
-            vector = any(exercise.shapes.values())
-            if isinstance(error, ShapeError) and (sampled or not block.events or not vector):
-                raise
-            self.kinds[kind] = str(error)
-            return error
-        bench = Bench(exercise, sampled, traced)
-        checks[f"{kind}: purity"] = f"{equations} equations"
-        if hasattr(block, "after_start"):
-            checks[f"{kind}: after_start"] = check_after_start(exercise, sampled, places, traced.states)
-        check_shapes(bench)
-        checks[f"{kind}: trace"] = f"as NumPy to {check_trace(bench):.1e}, at {len(bench.points)} points"
-        checks[f"{kind}: derivatives"] = f"as differences to {check_derivatives(bench):.1e}"
-        measured, unseen = check_feedthrough(bench)
-        self.feedthrough[kind], self.unseen[kind] = frozenset(measured), frozenset(unseen)
-        self.swallowed[kind] = frozenset(find_swallowed(bench, measured))
-        checks[f"{kind}: feedthrough"] = f"{len(measured)} pairs, {len(unseen)} more in the trace"
-        if guards := check_guards(bench):
-            checks[f"{kind}: guards"] = str(guards)
-        if not sampled:
-            checks[f"{kind}: smooth"] = f"{check_smooth(bench, self.announced, self.duration)} intervals"
-            fired, self.quiet = check_events(bench)
-            if block.events:
-                checks[f"{kind}: events"] = f"{fired} fired in small steps"
-        self.check_run_in(sampled)
-        return None
+def _report(
+    block: Block, kind: str, checks: Mapping[str, str], pairs: Iterable[Pairs] = (), quiet: Iterable[str] = ()
+) -> BlockReport:
+    """Return the findings in a subsystem of one kind: results by rule, and the sets of pairs of a `BlockReport`."""
+    by_kind = ({kind: found} for found in pairs)
+    return BlockReport(
+        block.label,
+        {kind: "checked"},
+        {f"{kind}: {rule}": text for rule, text in checks.items()},
+        *by_kind,
+        quiet=tuple(sorted(quiet)),
+    )
 
-    def check_run_in(self, sampled: bool) -> None:
-        """Check a run in a subsystem of one kind."""
-        kind = kind_text(sampled)
-        text, fired = check_run(self.exercise, sampled)
-        self.quiet -= fired
-        self.checks[f"{kind}: run"], self.kinds[kind] = text, "checked"
 
-    def report(self) -> BlockReport:
-        """Return the findings as a report."""
-        return BlockReport(
-            self.exercise.block.label,
-            self.kinds,
-            self.checks,
-            self.feedthrough,
-            self.unseen,
-            self.swallowed,
-            tuple(sorted(self.quiet)),
-        )
+def _gather(label: str, checks: Mapping[str, str], parts: Sequence[BlockReport]) -> BlockReport:
+    """Return one report of the findings that hold for all kinds of subsystems, and of those for each kind."""
+    return BlockReport(
+        label,
+        {kind: text for part in parts for kind, text in part.kinds.items()},
+        {**checks, **{rule: text for part in parts for rule, text in part.checks.items()}},
+        *(
+            {k: v for part in parts for k, v in getattr(part, name).items()}
+            for name in ("feedthrough", "unseen", "swallowed")
+        ),
+        quiet=tuple(name for part in parts for name in part.quiet),
+    )
