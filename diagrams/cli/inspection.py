@@ -38,6 +38,8 @@ def _inspect(arguments: argparse.Namespace) -> int:
 
 
 def _summary_lines(s: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+    """Yield label and text of each line; lines without a label continue the one before."""
+    # What it is, and who made it.
     version = f", version {s['version']}" if s["version"] else ""
     yield "model", f"{s['model_name']}{version}"
     if s["description"]:
@@ -63,6 +65,7 @@ def _summary_lines(s: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
         given = s["default_experiment"]
         text = [f"{key.replace('_', ' ')} {value}{'' if key == 'tolerance' else ' s'}" for key, value in given.items()]
         yield "experiment", ", ".join(text)
+    # Where it runs.
     yield "platforms", ", ".join(s["platforms"]) or "none"
     native = s["native"]
     state = "there is a binary" if native["available"] else "no binary"
@@ -75,6 +78,7 @@ def _summary_lines(s: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
         more = f" and {n - 1} more" if n > 1 else ""
         yield "", f"its binary takes symbols from the program that loads it: {first}{more}"
     yield "sources", f"{len(s['sources'])} files" if s["sources"] else "none"
+    # What is in it.
     counts = Counter(v["causality"] for v in s["variables"])
     yield "variables", ", ".join(f"{n} {name}" for name, n in counts.items()) or "none"
     yield "states", f"{s['continuous_states']} continuous; {s['event_indicators']} event indicators"

@@ -194,7 +194,7 @@ def _choose_kinds(kinds: Iterable[str]) -> list[bool]:
 def _check_in(
     exercise: Exercise, sampled: bool, announced: list[float], duration: float
 ) -> tuple[BlockReport, LoopwrightError | None]:
-    """Check the block in a subsystem of one kind; return the findings, and the error by which it refuses to be there."""
+    """Check the block in a subsystem of one kind; return the findings, and the error by which it refuses that kind."""
     block, kind, checks = exercise.block, kind_text(sampled), dict[str, str]()
     if block.transport or block.stepped:  # it has no equations
         checks["run"], _ = check_run(exercise, sampled)
