@@ -69,6 +69,11 @@ class FunctionInC(ABC):
         ``bind_block`` binds the blocks that an evaluator evaluates, where there are some.
         """
 
+    @property
+    def calls_python(self) -> bool:
+        """Whether C has Python evaluate parts of it: an interrupt (Ctrl-C) then waits until C has returned."""
+        return False
+
     def hand_over(self, to: Any) -> None:  # noqa: B027 (most have nothing to hand over)
         """Let generated code of the same function take its place wherever it is bound; C must not run meanwhile."""
 
@@ -135,6 +140,8 @@ _Call = ctypes.CFUNCTYPE(ctypes.c_int, _Vectors, _Vectors, ctypes.c_void_p, ctyp
 @dataclass(frozen=True, eq=False)
 class CalledFunction(CompiledFunction):
     """A CasADi function that C has Python evaluate: one of matrices, such as a table."""
+
+    calls_python = True
 
     def bind(
         self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
@@ -289,10 +296,12 @@ def bind_call(tick: FunctionInC, arguments: Sequence[np.ndarray], results: Seque
     def call() -> None:
         if function(of.arguments, of.results, of.iw, of.w, 0):
             raise bound.failures.pop()
-        if INTERRUPTS.came:
-            INTERRUPTS.check()
 
-    return call
+    def call_kept() -> None:
+        with INTERRUPTS.kept():
+            call()
+
+    return call_kept if tick.calls_python else call
 
 
 def list_vectors(vectors: Sequence[np.ndarray], length: int) -> Any:

@@ -47,6 +47,12 @@ class DiagramCode:
     notes: tuple[str, ...] = ()  # what a run reports of its code
 
     @property
+    def calls_python(self) -> bool:
+        """Whether C has Python evaluate parts of its functions."""
+        every = (*self.ticks.values(), *self.between.values(), *self.loops.values())
+        return any(function.calls_python for function in every)
+
+    @property
     def slope(self) -> CompiledFunction | SlopesByDifferences | None:
         """The derivative of the rates; None where nobody asks for it."""
         found = self.between.get("slope")

@@ -19,7 +19,6 @@ from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
 from .bound_functions import CALL, TICK, MemoryForC, TickStructure, at
 from .diagram_code import DiagramCode
-from .grouped_functions import GroupedTick
 from .model_exchange_in_c import NativeModelExchange
 from .newton import NewtonOptions, NewtonStructure
 from .plants_called_back import PythonStep, RemotePlants
@@ -157,7 +156,7 @@ class CompiledLoop:
         self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
         self._memory = memory = MemoryForC(code, arguments, results, plants, columns, exchange)
         self._bind_block = None if exchange is None else exchange.bind_block
-        self.calls_python = any(isinstance(t, GroupedTick) and t.calls_python for t in code.ticks.values())
+        self.calls_python = code.calls_python
         self._watched: list[tuple[HostState, ctypes.c_bool]] = [] if exchange is None else [*exchange.watched]
         t, x, _, _ = arguments
         x_next, _, log, ok = results

@@ -76,6 +76,11 @@ class SlopesByDifferences(FunctionInC):
         """Row and column of each entry."""
         return self.columns.pattern
 
+    @property
+    def calls_python(self) -> bool:
+        """Whether Python evaluates parts of the function."""
+        return self.rates.calls_python
+
     def bind(
         self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
     ) -> BoundFunction:

@@ -26,6 +26,11 @@ class Staged(FunctionInC):
     schedule: Schedule
     functions: Sequence[CompiledFunction]
 
+    @property
+    def calls_python(self) -> bool:
+        """Whether Python evaluates some of its functions."""
+        return any(function.calls_python for function in self.functions)
+
     def bind(
         self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
     ) -> BoundFunction:

@@ -1,5 +1,8 @@
 """Interpreted runs in C's loop, whose functions the virtual machine evaluates, and generated code that takes its place."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -7,7 +10,7 @@ from scipy.linalg import expm
 from loopwright.blocks import PID, Integrator, Lookup1D, Relay, Sine, StateSpace, TransferFunction, UnitDelay
 from loopwright.blocks.core import CompilerError
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled import background
+from loopwright.diagrams.compiled import background, bound_functions
 from loopwright.diagrams.simulation import change_over
 
 pytestmark = pytest.mark.one_tier
@@ -169,3 +172,36 @@ def test_without_a_library_and_a_compiler_the_error_says_what_to_install(monkeyp
             oscillator().simulate(3.0, step=1e-3, compile=False, **QUIET)
     finally:
         runtime.load_runtime.cache_clear()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends itself a signal")
+@pytest.mark.parametrize("clocked", [True, False])
+def test_an_interrupt_that_comes_as_a_table_is_evaluated_ends_the_run(monkeypatch, clocked):
+    """Python would raise it at the first instruction of the function that C calls, where ctypes drops it."""
+    entries, kind = [], bound_functions._Call
+
+    def entered(function):
+        def enter(*arguments):
+            entries.append(arguments[0])
+            if len(entries) == 30:
+                signal.raise_signal(signal.SIGINT)
+            return function(*arguments)
+
+        return kind(enter)
+
+    def inside(u):
+        return Lookup1D(breakpoints=[-2.0, 0.0, 2.0], values=[-1.0, 0.0, 3.0], name="table")(u)
+
+    if clocked:
+        diagram = Diagram("d", subsystem(sample_time=0.01, name="box")(inside)(Sine(frequency=1.0, name="source")))
+    else:
+        x = Integrator(initial_value=1.0, name="x")
+        diagram = Diagram("d", x(-inside(x.y)))
+    monkeypatch.setattr(bound_functions, "_Call", entered)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            diagram.simulate(10.0, step=0.01, solver="rk4", compile=False, **QUIET)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert len(entries) >= 30
