@@ -222,9 +222,9 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
 
     def error(found: str, expected: str) -> ParameterError:
         unit = f" in {spec.unit}" if spec.unit else ""
-        return ParameterError(
-            f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=owner, port=name
-        )
+        about = f": {spec.description.rstrip('.')}" if spec.description else ""
+        text = f"found {found}; expected {expected}{unit}. Give {name}= as that{about}."
+        return ParameterError(text, block=owner, port=name)
 
     kinds = _kinds(spec.annotation)
     # Most values are a float within its bounds, which needs no array.

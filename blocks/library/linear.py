@@ -67,11 +67,10 @@ class _StateSpace(Block):
             shapes["initial_state"] = (np.shape(self.initial_state) in ((), (n,)), f"a number or {n} numbers")
         for name, (fits, expected) in shapes.items():
             if not fits:
-                raise ParameterError(
-                    f"found shape {np.shape(getattr(self, name))}; expected {expected}. Write the matrices as nested "
-                    "lists of rows.",
-                    port=name,
-                )
+                is_state = name == "initial_state"
+                step = "Give one for each state." if is_state else "Write the matrices as nested lists of rows."
+                found = np.shape(getattr(self, name))
+                raise ParameterError(f"found shape {found}; expected {expected}. {step}", port=name)
         m, p = (int(np.prod(s, dtype=int)) for s in (np.shape(self.B)[1:], np.shape(self.C)[:-1]))
         check_names(self, input_names=m, output_names=p, state_names=n)
 

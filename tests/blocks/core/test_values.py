@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import math
 import pickle
 import runpy
 import types
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
+    PID,
+    PT1,
     AdmittanceFilter,
     Block,
     Circle,
@@ -27,6 +30,7 @@ from loopwright.blocks import (
     Sine,
     SmoothStep,
     State,
+    StateSpace,
     Step,
     TraceError,
     UnitDelay,
@@ -326,3 +330,23 @@ def test_an_error_of_a_users_check_names_the_block_by_itself():
         Band(upper=-1.0, name="narrow")
     with pytest.raises(ParameterError, match=r"^band\.lower: found lower above upper"):
         Band().replace(upper=-1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: PID(kp=math.nan), "PID.kp: found nan; expected finite numbers. Give kp= as that: proportional gain."),
+        (
+            lambda: PT1(time_constant=-1.0),
+            "PT1.time_constant: found -1; expected a value above 0 in s. Give time_constant= as that: time constant T.",
+        ),
+        (
+            lambda: StateSpace(A=[[0, 1], [0, 0]], B=[0, 1], C=[1, 0], initial_state=(1, 2, 3)),
+            "state_space.initial_state: found shape (3,); expected a number or 2 numbers. Give one for each state.",
+        ),
+    ],
+)
+def test_a_refused_value_has_a_next_step(make, text):
+    with pytest.raises(ParameterError) as refused:
+        make()
+    assert str(refused.value) == text
