@@ -115,6 +115,7 @@ def take_apart(
     entry = signal
     if signal is not None and not inside:
         entry = find_entry(diagram, point, ports, signal, wires, outputs, options)
+    # All but the plant, from its outputs and the measured force to the sources of its inputs; and the plant alone.
     injected = outputs if entry is None or inside else [*outputs, entry.name]
     model = linearize(diagram, point, inputs=injected, outputs=sources, openings=outputs, **options)
     model.refuse_delays("a contact")
@@ -124,6 +125,7 @@ def take_apart(
     felt = [] if signal is None else list(signal.entries)
     pushed, position, velocity = _find_entries(m, ports, measured, len(felt))
     wired, rows = m.inputs.entries(wires), m.outputs.entries(seen)
+    # The controller at each tick. A force that the plant measures itself comes by one of its outputs.
     own = [] if not inside or signal is None else [rows.index(m.outputs.slices[signal.port[1]].start + i) for i in felt]
 
     def cut(matrices: FourMatrices, states: Sequence[str]) -> StateMatrices:
@@ -140,11 +142,10 @@ def take_apart(
         K = ticks[0].matrices
     else:
         K = cut((model.A, model.B, model.C, model.D), model.states)
-    plant = StateMatrices(m.A, m.B[:, wired], m.C[rows], m.D[np.ix_(rows, wired)])
     n, U = len(m.A), m.error
     E = StateMatrices(U[:n, :n], U[:n, n:], U[n:, :n], U[n:, n:])
     _check_contact(path, ports, m, E, (pushed, position, velocity))
-    if signal is not None:
+    if signal is not None:  # it acts on the controller alone, and not on the force port again
         check_unit(diagram, path, ports, signal)
         check_command(flat, ports, signal, wires)
         entries = [wired.index(i) for i in pushed if i in wired]
@@ -155,7 +156,7 @@ def take_apart(
         return linearize(diagram, point, inputs=names, outputs=sources, openings=outputs, **options)
 
     parts = ContactParts(
-        plant=plant,
+        plant=_of_ports(StateMatrices(m.A, m.B, m.C, m.D), rows, wired),
         force=m.B[:, pushed],
         force_shown=m.D[np.ix_(rows, pushed)],
         position=m.C[position],
@@ -165,10 +166,7 @@ def take_apart(
         is_stepped=block.stepped,
         tool=find_tool(flat, ports, m, signal, entry, lead, sampled=bool(model.dt)),
         derivation=m.derivation,
-        errors=(
-            StateMatrices(E.A, E.B[:, wired], E.C[rows], E.D[np.ix_(rows, wired)]),
-            StateMatrices(E.A, E.B[:, pushed], E.C[position], E.C[velocity]),
-        ),
+        errors=(_of_ports(E, rows, wired), StateMatrices(E.A, E.B[:, pushed], E.C[position], E.C[velocity])),
         findings=_collect_findings(model, path),
         entry=None if entry is None else entry.name,
         ticks=ticks,
@@ -208,6 +206,11 @@ def _find_entries(
             port=ports.force,
         )
     return pushed, position, velocity
+
+
+def _of_ports(four: StateMatrices, rows: list[int], columns: list[int]) -> StateMatrices:
+    """Return matrices with some of their outputs and inputs."""
+    return StateMatrices(four.A, four.B[:, columns], four.C[rows], four.D[np.ix_(rows, columns)])
 
 
 def _widen(M: np.ndarray, by: int) -> np.ndarray:
