@@ -19,5 +19,7 @@ def enumerate_some(names: Iterable[str], most: int = 4) -> str:
 
 
 def count_of(n: int, noun: str) -> str:
-    """Return a number of things: ``"1 state"``, ``"3 states"``."""
-    return f"{n} {noun}{'' if n == 1 else 's'}"
+    """Return a number of things: ``"1 state"``, ``"3 states"``, ``"2 frequencies"``."""
+    if n == 1:
+        return f"{n} {noun}"
+    return f"{n} {noun[:-1]}ies" if noun[-1] == "y" and noun[-2] not in "aeiou" else f"{n} {noun}s"

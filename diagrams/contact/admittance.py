@@ -44,7 +44,7 @@ class ContactAdmittance:
 
     def __repr__(self) -> str:
         facts = (
-            count_of(len(self.omega), "frequency").replace("frequencys", "frequencies"),
+            count_of(np.size(self.omega), "frequency"),
             "with a target" if self.target is not None else "",
         )
         return brief("admittance at a contact, m/(N s)", *facts, then=".omega, .rendered, .target")

@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
+from ...blocks.core import OptionError, accepts, brief, count_of, explain_calls, kinds
 from ..flat import WiredDiagram
 from ..linearization import (
     PointLike,
@@ -129,7 +129,7 @@ class FrequencyResponse:
     def __repr__(self) -> str:
         w = self.omega
         facts = (
-            f"{w.size} frequencies",
+            count_of(w.size, "frequency"),
             f"{w.min():.4g} to {w.max():.4g} rad/s" if w.size else "",
             f"{int(self.settled.sum())} settled",
         )

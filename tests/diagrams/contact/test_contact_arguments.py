@@ -105,6 +105,13 @@ def test_frequencies_are_positive_numbers(value):
         cart_contact().admittance(value)
 
 
+@pytest.mark.parametrize(
+    ("omega", "said"), [(3.0, "1 frequency"), ([1.0], "1 frequency"), ([1.0, 2.0], "2 frequencies")]
+)
+def test_an_admittance_says_at_how_many_frequencies_it_is(omega, said):
+    assert said in repr(cart_contact().admittance(omega))
+
+
 def test_a_limit_that_is_confirmed_is_one_of_the_contact():
     here = cart_contact()
     limit = here.stability_limit()
