@@ -171,7 +171,7 @@ def test_neighbours_import_from_the_sub_package_and_nothing_private():
 
 
 def test_the_pages_name_what_exists():
-    text = PAGE.read_text(encoding="utf-8") + (PAGE.parent / "time.md").read_text(encoding="utf-8")
+    text = "\n".join((PAGE.parent / name).read_text(encoding="utf-8") for name in (PAGE.name, "time.md", "paper.md"))
     named = set(re.findall(r"`((?:blocks|fmus|diagrams|front|tests|docs|benchmarks|notebooks)/[\w/.-]*)`", text))
     assert len(named) > 30
     assert not [name for name in named if not (ROOT / name).exists() and not (ROOT / f"{name}.py").exists()]

@@ -63,13 +63,6 @@ class FeedbackLinearization(Block):
         """The motor force in the model's unit."""
         return {"motor_force": Output(shape=(2,), unit=self.model.input_unit, name="motor_force")}
 
-    @property
-    def motor_force(self) -> Any:
-        """The motor force as a signal."""
-        from ..core import Signal
-
-        return Signal(self, "motor_force")
-
     def check(self) -> None:
         """Refuse a model without its equations."""
         for name, text in (("f_v", "f_v(x_c, x_v)"), ("G_v", "G_v(x_c)")):

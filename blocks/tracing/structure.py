@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import numpy as np
 
 from ..core import Block, Value, identity
+
+_NUMBERS = (float, np.ndarray)
 
 
 def traced_parameters(block: Value, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -16,7 +18,7 @@ def traced_parameters(block: Value, prefix: str = "") -> Iterator[tuple[str, Any
         value = block.__dict__[name]
         if isinstance(value, Block):
             yield from traced_parameters(value, f"{prefix}{name}.")
-        elif isinstance(value, float | np.ndarray) and not spec.structural:
+        elif isinstance(value, _NUMBERS) and not spec.structural:
             yield prefix + name, value
 
 
@@ -39,13 +41,29 @@ def structure(block: Value, *, nested: bool = False) -> Any:
 def _item(value: Any, *, structural: bool) -> tuple[Any, ...]:
     if isinstance(value, Block):
         return (structure(value, nested=True),)
-    if isinstance(value, float | np.ndarray) and not structural:
+    if isinstance(value, _NUMBERS) and not structural:
         return np.shape(value), (np.asarray(value) == 0).tobytes()
     return (identity(value),)
 
 
-def has_structure(block: Value, other: Value, *, nested: bool = False) -> bool:
-    """Whether two blocks have equal structures; values that both share are not looked at."""
+def has_structure(block: Value, other: Value) -> bool:
+    """Whether two blocks have equal structures."""
+    return _agree(block, other, _have_same_zeros)
+
+
+def is_traced_by(block: Value, other: Value) -> bool:
+    """Whether another block's trace holds for this block: equal structure, with its exact zeros among this one's."""
+    return _agree(block, other, lambda new, old: not np.any((np.asarray(old) == 0) & (np.asarray(new) != 0)))
+
+
+def _have_same_zeros(new: float | np.ndarray, old: float | np.ndarray) -> bool:
+    if isinstance(new, float):
+        return bool((new == 0.0) == (old == 0.0))
+    return bool(np.array_equal(new == 0.0, old == 0.0))
+
+
+def _agree(block: Value, other: Value, fits: Callable[[Any, Any], bool], *, nested: bool = False) -> bool:
+    """Whether two blocks have equal fixed values, and numbers of equal shapes that fit; shared ones are passed over."""
     if type(block) is not type(other):
         return False
     left_out = _left_out(block, nested)
@@ -54,31 +72,11 @@ def has_structure(block: Value, other: Value, *, nested: bool = False) -> bool:
         if new is old or name in left_out:
             continue
         if isinstance(new, Block) and isinstance(old, Block):
-            if not has_structure(new, old, nested=True):
-                return False
-        elif isinstance(new, float) and isinstance(old, float) and not spec.structural:
-            if (new == 0.0) != (old == 0.0):
-                return False
-        elif _item(new, structural=spec.structural) != _item(old, structural=spec.structural):
-            return False
-    return True
-
-
-def is_traced_by(block: Value, other: Value, *, nested: bool = False) -> bool:
-    """Whether another block's trace holds for this block: equal structure, with its exact zeros among this one's."""
-    if type(block) is not type(other):
-        return False
-    left_out = _left_out(block, nested)
-    for name, spec in type(block).parameter_specs.items():
-        new, old = block.__dict__[name], other.__dict__[name]
-        if name in left_out:
-            continue
-        if isinstance(old, Block):
-            if not (isinstance(new, Block) and is_traced_by(new, old, nested=True)):
-                return False
-        elif isinstance(old, float | np.ndarray) and not spec.structural:
-            if np.shape(new) != np.shape(old) or np.any((np.asarray(old) == 0) & (np.asarray(new) != 0)):
-                return False
-        elif identity(new) != identity(old):
+            alike = _agree(new, old, fits, nested=True)
+        elif isinstance(new, _NUMBERS) and isinstance(old, _NUMBERS) and not spec.structural:
+            alike = getattr(new, "shape", ()) == getattr(old, "shape", ()) and fits(new, old)
+        else:
+            alike = identity(new) == identity(old)
+        if not alike:
             return False
     return True
