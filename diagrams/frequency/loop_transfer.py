@@ -64,6 +64,8 @@ class LoopPlots:
 
     linearization: Any = None
     wires: tuple[str, ...] = ()
+    place: str = ""
+    """The place of the cut in words, where it is ahead of some consumers of a wire."""
     inexactness: float = 0.0
     findings: tuple[Any, ...] = ()
     dt: Any
@@ -80,7 +82,10 @@ class LoopPlots:
         found = count_of(len(self.findings), "finding") * bool(self.findings)
         facts = count_of(self.nstates, "state"), delays, sampling, found, "constant 0" * self._is_zero()
         then = "margins(loop), loop.bode(), loop.nyquist()" + ", print(…) shows its matrices" * (not delays)
-        return brief(f"loop at {', '.join(self.wires)}" if self.wires else "loop", *facts, then=then)
+        return brief(self._head(), *facts, then=then)
+
+    def _head(self) -> str:
+        return f"loop at {self.place or ', '.join(self.wires)}" if self.wires else "loop"
 
     def _repr_html_(self) -> str | None:
         """Return a short table for a notebook; python-control's matrices grow with the states."""
@@ -90,9 +95,8 @@ class LoopPlots:
             ("sampling", f"T = {self.dt:g} s" if self.dt else "continuous"),
             ("value", "0 at all frequencies: nothing comes back to this wire" * self._is_zero()),
         )
-        head = f"loop at {', '.join(self.wires)}" if self.wires else "loop"
         findings = Grid("Left out of the model", ("finding",), tuple((str(one),) for one in self.findings))
-        return Sheet(head, facts, (findings,), ("margins(loop), loop.bode(), loop.nyquist()",)).as_html()
+        return Sheet(self._head(), facts, (findings,), ("margins(loop), loop.bode(), loop.nyquist()",)).as_html()
 
     def _is_zero(self) -> bool:
         """Whether no way leads from the cut wire back to it, as at the output of a source."""

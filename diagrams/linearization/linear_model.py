@@ -447,6 +447,7 @@ class Linearization(ShownAsTable):
             made = model.loop(*port, lifted=lifted, slow=slow)
             name = f"L({', '.join(wires)} to {', '.join(_as_list(to))})"
             made.name = name.replace(".", "_")  # python-control refuses dots in names
+            made.place = f"{', '.join(wires)} → {', '.join(_as_list(to))}"
             return made
         cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
         made = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class(), sign=-1.0)

@@ -149,3 +149,9 @@ def test_mistakes_name_what_was_found_and_a_next_step():
             u = Input()
             actual = Input(tracks="v")
             y = Output()
+
+
+def test_a_loop_ahead_of_a_consumer_is_shown_with_the_names_that_were_asked_for():
+    loop = level(T).linearize().loop("opening", to="tank.u")
+    assert repr(loop).startswith("<loop at opening → tank.u: ")
+    assert "loop at opening → tank.u" in loop._repr_html_()
