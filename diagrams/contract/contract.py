@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -216,7 +218,11 @@ def _check_in(
     checks["trace"] = f"as NumPy to {check_trace(bench):.1e}, at {len(bench.points)} points"
     checks["derivatives"] = f"as differences to {check_derivatives(bench):.1e}"
     measured, unseen = check_feedthrough(bench)
-    pairs = frozenset(measured), frozenset(unseen), frozenset(find_swallowed(bench, measured))
+    pairs = {
+        "feedthrough": frozenset(measured),
+        "unseen": frozenset(unseen),
+        "swallowed": frozenset(find_swallowed(bench, measured)),
+    }
     checks["feedthrough"] = f"{len(measured)} pairs, {len(unseen)} more in the trace"
     if guards := check_guards(bench):
         checks["guards"] = str(guards)
@@ -231,28 +237,26 @@ def _check_in(
 
 
 def _report(
-    block: Block, kind: str, checks: Mapping[str, str], pairs: Iterable[Pairs] = (), quiet: Iterable[str] = ()
+    block: Block,
+    kind: str,
+    checks: Mapping[str, str],
+    pairs: Mapping[str, Pairs] = MappingProxyType({}),
+    quiet: Iterable[str] = (),
 ) -> BlockReport:
     """Return the findings in a subsystem of one kind: results by rule, and the sets of pairs of a `BlockReport`."""
-    by_kind = ({kind: found} for found in pairs)
-    return BlockReport(
-        block.label,
-        {kind: "checked"},
-        {f"{kind}: {rule}": text for rule, text in checks.items()},
-        *by_kind,
-        quiet=tuple(sorted(quiet)),
-    )
+    results = {f"{kind}: {rule}": text for rule, text in checks.items()}
+    found: dict[str, Any] = {name: {kind: some} for name, some in pairs.items()}
+    return replace(BlockReport(block.label, {kind: "checked"}, results, quiet=tuple(sorted(quiet))), **found)
 
 
 def _gather(label: str, checks: Mapping[str, str], parts: Sequence[BlockReport]) -> BlockReport:
     """Return one report of the findings that hold for all kinds of subsystems, and of those for each kind."""
     return BlockReport(
         label,
-        {kind: text for part in parts for kind, text in part.kinds.items()},
-        {**checks, **{rule: text for part in parts for rule, text in part.checks.items()}},
-        *(
-            {k: v for part in parts for k, v in getattr(part, name).items()}
-            for name in ("feedthrough", "unseen", "swallowed")
-        ),
+        kinds={kind: text for part in parts for kind, text in part.kinds.items()},
+        checks={**checks, **{rule: text for part in parts for rule, text in part.checks.items()}},
+        feedthrough={kind: pairs for part in parts for kind, pairs in part.feedthrough.items()},
+        unseen={kind: pairs for part in parts for kind, pairs in part.unseen.items()},
+        swallowed={kind: pairs for part in parts for kind, pairs in part.swallowed.items()},
         quiet=tuple(name for part in parts for name in part.quiet),
     )
