@@ -11,9 +11,10 @@ from .entry_order import OrderStep
 from .evaluation_order import Order, find_orders
 from .first_order_hold import first_order_hold
 from .parameter_names import find_control, find_name, find_path, find_place, split_path
-from .structure import Structure, SubsystemSettings, SubsystemTable, Wire, join, stepped_blocks
+from .structure import Structure, Wire, join, stepped_blocks
 from .structure_table import sheet_of_structure
-from .subsystems import Subsystem, SubsystemCall, exact_time, subsystem
+from .subsystem_settings import SubsystemSettings, SubsystemTable, exact_time
+from .subsystems import Subsystem, SubsystemCall, subsystem
 from .variants import apply_changes, change_parameter, change_parameters
 from .wire_units import add_unit_conversions
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ...blocks.core import (
     Block,
@@ -18,7 +18,8 @@ from ...blocks.core import (
     shorten,
 )
 from .buses import Bus
-from .structure import Structure, SubsystemSettings, Wire, join
+from .structure import Structure, Wire, join
+from .subsystem_settings import SubsystemSettings
 from .subsystems import SubsystemCall, SubsystemInput
 
 
@@ -109,17 +110,9 @@ class Collector:
         places = _Places(self.subsystems.values())
         table = Structure(subsystems={"": SubsystemSettings("", None, "exact")})
         for inner in sorted(self.subsystems.values(), key=lambda s: (places.path(s).count("."), places.path(s))):
-            path, made = places.path(inner), inner.subsystem
-            table.subsystems[path] = SubsystemSettings(
-                path,
-                made.sample_time,
-                made.method,
-                tuple(inner.wires),
-                tuple(inner.outputs),
-                made.offset,
-                made.delay,
-                made.control,
-                made.when,
+            path = places.path(inner)
+            table.subsystems[path] = replace(
+                inner.subsystem.settings, path=path, inputs=tuple(inner.wires), outputs=tuple(inner.outputs)
             )
         subsystems = {key: self._find_subsystem(key, places) for key in self.blocks}
         paths = places.place_blocks(self.blocks, subsystems)

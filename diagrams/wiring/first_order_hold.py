@@ -7,7 +7,8 @@ from typing import Any
 
 from ...blocks.core import Gain, Signal, check_name, explain_calls
 from ...blocks.library import Sawtooth, UnitDelay
-from .subsystems import exact_time, subsystem
+from .subsystem_settings import exact_time
+from .subsystems import subsystem
 
 
 @explain_calls

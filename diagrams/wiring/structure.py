@@ -13,67 +13,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from ...blocks.core import Block, Grid, Shape, Sheet, ShownAsTable, brief, explain_calls
-
-
-@explain_calls
-@dataclass(frozen=True)
-class SubsystemSettings:
-    """Settings of a subsystem, or of the diagram itself (path "").
-
-    Attributes
-    ----------
-    sample_time : Fraction or None
-        Its own sample time in s; None where that of its surroundings holds.
-    method : str or None
-        Discretization of continuous blocks in it; None: as in its surroundings, see `Structure.method`.
-    offset : Fraction
-        Time of its first tick in s, where it has a sample time.
-    delay : int
-        Computational delay of its outputs in samples.
-    control : str
-        "enabled" or "triggered" for a subsystem that acts on a condition, else "".
-    when : str
-        For an enabled subsystem "held" or "reset": its states when it is enabled again. For a triggered one the edge:
-        "rising", "falling" or "both".
-    """
-
-    path: str
-    sample_time: Fraction | None
-    method: str | None
-    inputs: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
-    offset: Fraction = Fraction(0)
-    delay: int = 0
-    control: str = ""
-    when: str = ""
-
-    def __repr__(self) -> str:
-        facts = [text for text in (self.rate, f"{self.control} ({self.when})" if self.control else "") if text]
-        return f"<settings of {self.path or 'the diagram'}: {', '.join(facts) or 'those around it'}>"
-
-    @property
-    def rate(self) -> str:
-        """Its sample time, offset and delay in words; "" where it has none."""
-        if self.sample_time is None:
-            return ""
-        offset = f" from {float(self.offset):g} s on" if self.offset else ""
-        delay = f", delay {self.delay}" if self.delay else ""
-        return f"every {float(self.sample_time):g} s{offset}{delay}"
-
-
-class SubsystemTable(dict[str, SubsystemSettings], ShownAsTable):
-    """Settings of subsystems by path, shown as a table."""
-
-    def __repr__(self) -> str:
-        return brief("subsystems", *(path for path in self if path), then='["path"].sample_time')
-
-    def _sheet(self) -> Sheet:
-        rows = [
-            (path or "(the diagram)", one.rate, f"{one.control} {one.when}".strip(), ", ".join(one.inputs))
-            for path, one in self.items()
-        ]
-        return Sheet("subsystems", (), (Grid("", ("path", "sample time", "control", "inputs"), tuple(rows)),))
+from ...blocks.core import Block, Shape, explain_calls
+from .subsystem_settings import SubsystemSettings
 
 
 @explain_calls

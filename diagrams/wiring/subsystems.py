@@ -5,13 +5,12 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, KeysView, Mapping
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, SupportsFloat, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, overload
 
 from ...blocks.core import (
     Call,
     DoubleDriveError,
     Grid,
-    SampleTimeError,
     Sheet,
     ShownAsTable,
     Signal,
@@ -25,57 +24,10 @@ from ...blocks.core import (
     explain_calls,
     near,
     offer_elsewhere,
-    read_time,
     recorder,
 )
-from ...blocks.tracing import check_method
 from .buses import Bus, flatten, is_bus, name_ports, nest
-
-ENABLED, TRIGGERED = ("held", "reset"), ("rising", "falling", "both")
-
-
-def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
-    """Return a sample time as an exact fraction of a second: a Fraction as it is, a float as `read_time` reads it."""
-    try:
-        time = value if isinstance(value, Fraction) else read_time(float(value))
-    except (TypeError, ValueError, OverflowError):
-        raise SampleTimeError(
-            f"found the sample time {value!r}; expected seconds, such as 1e-3.", block=block
-        ) from None
-    if float(value) <= 0:
-        raise SampleTimeError(f"found a sample time of {float(value):g} s; expected a positive one.", block=block)
-    if time is None:
-        raise SampleTimeError(
-            f"found a sample time of {float(value)!r} s, which is neither a multiple of 1 ns nor a fraction with a "
-            f"denominator up to 1,000,000. Give a Fraction, which is taken exactly, or round it"
-            f"{f', for instance to {near!r}' if (near := round(float(value), 9)) else ''}.",
-            block=block,
-        )
-    return time
-
-
-def exact_offset(value: SupportsFloat | str, sample_time: Fraction | None, *, block: str) -> Fraction:
-    """Return an offset as an exact fraction of a second."""
-    if isinstance(value, int | float | Fraction) and not isinstance(value, bool) and value == 0:
-        return Fraction(0)
-    offset = exact_time(value, block=block)
-    if sample_time is None:
-        raise SampleTimeError("it has an offset but no sample time; give it sample_time=….", block=block)
-    if offset >= sample_time:
-        raise SampleTimeError(
-            f"found an offset of {float(offset):g} s; expected less than the sample time, {float(sample_time):g} s.",
-            block=block,
-        )
-    return offset
-
-
-def check_delay(value: object, sample_time: Fraction | None, *, block: str) -> int:
-    """Return a computational delay in samples, checked."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise SampleTimeError(f"found delay={value!r}; expected a whole number of samples, 0 or more.", block=block)
-    if value and sample_time is None:
-        raise SampleTimeError("it has a delay but no sample time; give it sample_time=….", block=block)
-    return value
+from .subsystem_settings import CONTROL_INPUTS, SubsystemSettings
 
 
 class SubsystemInput:
@@ -102,41 +54,16 @@ class SubsystemKeywords(TypedDict, total=False):
 class Subsystem(ShownAsTable):
     """A function of signals that is used in a diagram like a block; made by `subsystem`, called like a block."""
 
-    def __init__(
-        self,
-        function: Callable[..., object],
-        *,
-        sample_time: float | Fraction | None = None,
-        method: str | None = None,
-        name: str | None = None,
-        offset: float | Fraction = 0,
-        delay: int = 0,
-        enabled: str | None = None,
-        triggered: str | None = None,
-    ):
-        self.function, self.method = function, method
+    def __init__(self, function: Callable[..., object], **keywords: Unpack[SubsystemKeywords]):
+        self.function, self._keywords = function, keywords
         own = str(getattr(function, "__name__", ""))  # a functools.partial has none, a lambda no identifier
-        own = own if own.isidentifier() else "subsystem"
-        self.name = check_name(name or own)
-        if method is not None:
-            check_method(method, self.name)
-        self.sample_time = None if sample_time is None else exact_time(sample_time, block=self.name)
-        self.offset = exact_offset(offset, self.sample_time, block=self.name)
-        self.delay = check_delay(delay, self.sample_time, block=self.name)
-        self.enabled, self.triggered = enabled, triggered
-        if enabled is not None and triggered is not None:
-            raise WiringError(
-                "it is both enabled and triggered; put an enabled subsystem into a triggered one, or the reverse.",
-                block=self.name,
-            )
-        for value, key, allowed in ((enabled, "enabled", ENABLED), (triggered, "triggered", TRIGGERED)):
-            if value is not None and value not in allowed:
-                raise WiringError(
-                    f"found {key}={value!r}; expected {' or '.join(map(repr, allowed))}.", block=self.name
-                )
-        self.control = "enabled" if enabled else "triggered" if triggered else ""
-        self.when = enabled or triggered or ""
-        self.control_input = {"enabled": "enable", "triggered": "trigger", "": ""}[self.control]
+        self.name = check_name(keywords.get("name") or (own if own.isidentifier() else "subsystem"))
+        own_settings = {key: value for key, value in keywords.items() if key != "name"}
+        self.settings = SubsystemSettings.of(self.name, **own_settings)  # type: ignore[arg-type]
+        self.sample_time, self.method = self.settings.sample_time, self.settings.method
+        self.offset, self.delay = self.settings.offset, self.settings.delay
+        self.control, self.when = self.settings.control, self.settings.when
+        self.control_input = CONTROL_INPUTS[self.control]
         every = inspect.signature(function).parameters.values()
         self.parameters = [p for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD]
         self.open_ended = len(self.parameters) < len(every)
@@ -161,19 +88,12 @@ class Subsystem(ShownAsTable):
         UnknownNameError
             For any other name.
         """
-        known: SubsystemKeywords = {
-            "sample_time": self.sample_time,
-            "method": self.method,
-            "name": self.name,
-            "offset": self.offset,
-            "delay": self.delay,
-            "enabled": self.enabled,
-            "triggered": self.triggered,
-        }
         for key in changes:
-            if key not in known:
-                raise UnknownNameError(f"a subsystem has no {key!r}. {near(key, known)}", block=self.name)
-        options: SubsystemKeywords = {**known, **changes}
+            if key not in SubsystemKeywords.__annotations__:
+                raise UnknownNameError(
+                    f"a subsystem has no {key!r}. {near(key, SubsystemKeywords.__annotations__)}", block=self.name
+                )
+        options: SubsystemKeywords = {**self._keywords, **changes}
         return Subsystem(self.function, **options)
 
     def __call__(self, *args: object, **kwargs: object) -> SubsystemCall:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace as replace_fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,11 +19,9 @@ from ...blocks.core import (
     near,
     shorten,
 )
-from ...blocks.tracing import check_method
 from .entry_names import split_entry, with_entry
 from .parameter_names import OF_A_SUBSYSTEM, check_name, find_path, find_place, name_parameters
-from .structure import Structure, SubsystemSettings
-from .subsystems import check_delay, exact_offset, exact_time
+from .structure import Structure
 
 V = TypeVar("V", bound=Value)
 
@@ -121,7 +118,7 @@ def _change(table: Structure, path: str, keys: list[str], value: object) -> None
             f"parameter of it: {name_parameters(table.blocks[path], path)}." + f" {made}." * bool(made),
             block=path,
         )
-    table.subsystems[path] = _change_subsystem(table.subsystems[path], keys[0], value)
+    table.subsystems[path] = table.subsystems[path].changed(keys[0], value)
 
 
 def _used_ports(table: Structure, path: str) -> tuple[set[str], set[str]]:
@@ -141,24 +138,6 @@ def _find_subsystem(table: Structure, path: str, key: str, diagram: str) -> str 
     offered = ", ".join(f"{subsystem}.{key}" for subsystem in known)
     step = f"its subsystems have: {offered}" if offered else "leave it out: this diagram has no subsystem"
     raise UnknownNameError(f"a diagram has no {key!r}; {step}.")
-
-
-def _change_subsystem(settings: SubsystemSettings, key: str, value: Any) -> SubsystemSettings:
-    """Return a subsystem's settings with another sample time, method, offset or delay."""
-    new, path = value, settings.path
-    if key == "sample_time" and value is not None:
-        new = exact_time(value, block=path)
-    elif key == "method" and value is not None:
-        check_method(value, path)
-    elif key == "offset":
-        new = exact_offset(value, settings.sample_time, block=path)
-    elif key == "delay":
-        new = check_delay(value, settings.sample_time, block=path)
-    changed: dict[str, Any] = {key: new}
-    if key == "sample_time":
-        exact_offset(settings.offset, new, block=path)
-        check_delay(settings.delay, new, block=path)
-    return replace_fields(settings, **changed)
 
 
 def change_parameter(block: V, keys: list[str], value: object) -> V:
