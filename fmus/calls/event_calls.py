@@ -65,6 +65,11 @@ class EventCalls:
     """Memory of the answers."""
 
 
+def addresses_in(info: ctypes.Structure, *names: str) -> list[int]:
+    """Return the addresses of fields of a structure."""
+    return [ctypes.addressof(info) + getattr(type(info), name).offset for name in names]
+
+
 def check_next_time(label: str, found: float, t: float) -> float:
     """Return the time of a next event in s, as an event at time t has set it; refuse one that is no number."""
     if math.isnan(found):

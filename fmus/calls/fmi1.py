@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from .event_calls import AnswersAt, EventCalls, EventUpdate
+from .event_calls import AnswersAt, EventCalls, EventUpdate, addresses_in
 from .fmi_calls import FmiCalls, FmiVersion, Log, TypeCalls, make_callbacks
 
 _NO_STATUS = {
@@ -37,14 +37,7 @@ class Fmi1Calls(FmiCalls):
             "Boolean": TypeCalls("Boolean", ctypes.c_bool),
             "Enumeration": TypeCalls("Integer", ctypes.c_int32),
         },
-        exchange={
-            "set_time": "SetTime",
-            "set_states": "SetContinuousStates",
-            "get_states": "GetContinuousStates",
-            "derivatives": "GetDerivatives",
-            "indicators": "GetEventIndicators",
-            "nominals": "GetNominalContinuousStates",
-        },
+        exchange={"derivatives": "GetDerivatives", "nominals": "GetNominalContinuousStates"},
         required=("GetVersion", "InstantiateSlave", "InitializeSlave", "FreeSlaveInstance", "DoStep"),
         required_of_models=(
             *("GetVersion", "InstantiateModel", "Initialize", "FreeModelInstance", "SetTime", "EventUpdate"),
@@ -94,9 +87,7 @@ class Fmi1Calls(FmiCalls):
         info, wanted, final = self.variable(fmi1EventInfo), self.variable(ctypes.c_uint8), self.variable(ctypes.c_int)
         instance, never, at = self.instance_argument, self.variable(ctypes.c_uint8), ctypes.addressof
         names = ("iterationConverged", "terminateSimulation", "stateValueReferencesChanged", "upcomingTimeEvent")
-        settled, ends, others, defined, time = (
-            at(info) + getattr(type(info), name).offset for name in (*names, "nextEventTime")
-        )
+        settled, ends, others, defined, time = addresses_in(info, *names, "nextEventTime")
         return EventCalls(
             enter=None,
             update=(self.function("EventUpdate"), (instance, ctypes.c_bool(False), ctypes.byref(info))),

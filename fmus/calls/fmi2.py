@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
-from .event_calls import AnswersAt, EventCalls
+from .event_calls import AnswersAt, EventCalls, addresses_in
 from .fmi_calls import FmiCalls, FmiVersion, Log, TypeCalls, make_callbacks
 
 
@@ -19,14 +19,7 @@ class Fmi2Calls(FmiCalls):
             "Boolean": TypeCalls("Boolean", ctypes.c_int32),
             "Enumeration": TypeCalls("Integer", ctypes.c_int32),
         },
-        exchange={
-            "set_time": "SetTime",
-            "set_states": "SetContinuousStates",
-            "get_states": "GetContinuousStates",
-            "derivatives": "GetDerivatives",
-            "indicators": "GetEventIndicators",
-            "nominals": "GetNominalsOfContinuousStates",
-        },
+        exchange={"derivatives": "GetDerivatives"},
         required=(
             *("GetVersion", "Instantiate", "FreeInstance", "SetupExperiment"),
             *("EnterInitializationMode", "ExitInitializationMode", "Terminate"),
@@ -56,10 +49,7 @@ class Fmi2Calls(FmiCalls):
         final, instance, at = self.variable(ctypes.c_int), self.instance_argument, ctypes.addressof(flags)
         final.value = 1
         names = ("newDiscreteStatesNeeded", "terminateSimulation", "nominalsOfContinuousStatesChanged")
-        again, ends, nominals, defined, time = (
-            ctypes.addressof(info) + getattr(type(info), name).offset
-            for name in (*names, "nextEventTimeDefined", "nextEventTime")
-        )
+        again, ends, nominals, defined, time = addresses_in(info, *names, "nextEventTimeDefined", "nextEventTime")
         return EventCalls(
             enter=self._mode_call("EnterEventMode"),
             update=(self.function("NewDiscreteStates"), (instance, ctypes.byref(info))),

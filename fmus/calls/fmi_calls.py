@@ -70,6 +70,16 @@ class TypeCalls:
     ctype: type[Any]
 
 
+_EXCHANGE = {
+    "set_time": "SetTime",
+    "set_states": "SetContinuousStates",
+    "get_states": "GetContinuousStates",
+    "indicators": "GetEventIndicators",
+    "nominals": "GetNominalsOfContinuousStates",
+}
+"""Ends of the names of the functions of model exchange that each evaluation calls."""
+
+
 @dataclass(frozen=True)
 class FmiVersion:
     """Names of functions in a version of FMI, and shapes of their arguments."""
@@ -78,7 +88,7 @@ class FmiVersion:
     types: Mapping[str, TypeCalls]
     """Functions by type, as FMI 3.0 names types."""
     exchange: Mapping[str, str]
-    """Ends of the names of the functions of model exchange that each evaluation calls."""
+    """Ends of the names of functions of model exchange that are others than those of `_EXCHANGE`."""
     required: tuple[str, ...]
     """Ends of the names of functions without which an FMU can't run."""
     final: type[Any]
@@ -457,7 +467,7 @@ class FmiCalls(ABC):
 
         These take instance, address and length: "set_states", "get_states", "derivatives", "indicators", "nominals".
         """
-        return self.function(self.table.exchange[name])
+        return self.function(self.table.exchange.get(name) or _EXCHANGE[name])
 
     @cached_property
     def instance_argument(self) -> ctypes.c_void_p:

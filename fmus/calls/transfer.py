@@ -134,17 +134,6 @@ class Transfer:
                 worst = status
         return worst
 
-    def get(self) -> int:
-        """Get the values into the vector; return the first status that is no success, else 1 for a warning, else 0."""
-        worst = 0
-        for group in self.groups:
-            if status := group.function(*group.arguments):
-                if status > WARNING:
-                    return status
-                worst = status
-            group.spread(self.vector)
-        return worst
-
 
 class UnfitError(Exception):
     """A value that doesn't fit: its port, and the reason, as "found …; expected …"."""
@@ -158,8 +147,20 @@ class OutOfRangeError(UnfitError):
     """A value out of the range that the FMU's description states."""
 
 
-class TypeGroup:
-    """Ports of one type: the buffer of their values, and their places in the vector."""
+class TypedCall:
+    """The call that gets or sets variables of one type, and the buffer of their values, made here if none is given."""
+
+    def __init__(self, fmi: FmiCalls, verb: str, variables: Sequence[FmuVariable], buffer: np.ndarray | None = None):
+        type_, references = variables[0].type, [r for v in variables for r in v.references]
+        self.size = sum(v.size for v in variables)
+        self.buffer = fmi.allocate(self.size, fmi.types[type_].ctype) if buffer is None else buffer
+        self._kept = (ctypes.c_uint * max(1, len(references)))(*references)  # as long as its address is an argument
+        self.function = fmi.value_function(verb, type_)
+        self.arguments = fmi.value_arguments(self._kept, len(references), self.buffer.ctypes.data, self.size)
+
+
+class TypeGroup(TypedCall):
+    """Ports of one type: the call with their values, and their places in the vector."""
 
     def __init__(
         self,
@@ -171,20 +172,12 @@ class TypeGroup:
         vector: np.ndarray,
     ):
         self.ports, self.places = ports, places
-        references = [r for v in ports.values() for r in v.references]
-        self.size = sum(v.size for v in ports.values())
-        self.is_whole = type_ == "Float64" and self.size == vector.size
+        variables = [*ports.values()]
+        self.is_whole = type_ == "Float64" and sum(v.size for v in variables) == vector.size
         self.direct = self.is_whole and fmi.in_process
-        self.is_integer = any(v.is_integer for v in ports.values())
+        self.is_integer = any(v.is_integer for v in variables)
         self.index = np.concatenate([np.arange(s.start, s.stop) for s in places.values()])
-        kept = (ctypes.c_uint * max(1, len(references)))(*references)
-        if self.direct:
-            self.buffer: np.ndarray = vector
-        else:
-            self.buffer = fmi.allocate(self.size, fmi.types[type_].ctype)
-        self._kept = kept  # as long as its address is in the arguments
-        self.function = fmi.value_function(verb, type_)
-        self.arguments = fmi.value_arguments(kept, len(references), self.buffer.ctypes.data, self.size)
+        super().__init__(fmi, verb, variables, vector if self.direct else None)
 
     @property
     def limits(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -259,7 +252,7 @@ class BoundReading:
     def __init__(self, fmi: FmiCalls):
         self.fmi = fmi
         self._seen: set[tuple[str, ...]] = set()
-        self._lists: dict[tuple[str, ...], tuple[BoundCalls, list[np.ndarray]]] = {}
+        self._lists: dict[tuple[str, ...], tuple[BoundCalls, list[TypedCall]]] = {}
 
     def read(self, groups: Sequence[Sequence[FmuVariable]]) -> list[np.ndarray]:
         """Return the values of each group of variables of one type; nothing in process, or where a call fails."""
@@ -270,18 +263,7 @@ class BoundReading:
             if key not in self._seen or len(self._lists) >= _MOST_LISTS:
                 self._seen.add(key)
                 return []
-            self._lists[key] = self._bind(groups)
-        bound, values = self._lists[key]
-        return [np.array(v) for v in values] if 0 <= bound.run() <= WARNING else []
-
-    def _bind(self, groups: Sequence[Sequence[FmuVariable]]) -> tuple[BoundCalls, list[np.ndarray]]:
-        calls, values = [], []
-        for group in groups:
-            type_, size = group[0].type, sum(v.size for v in group)
-            references = [r for v in group for r in v.references]
-            kept = (ctypes.c_uint * len(references))(*references)
-            buffer = self.fmi.allocate(size, self.fmi.types[type_].ctype)
-            arguments = self.fmi.value_arguments(kept, len(references), buffer.ctypes.data, size)
-            calls.append((self.fmi.value_function("Get", type_), arguments))
-            values.append(buffer)
-        return self.fmi.bind(calls), values
+            made = [TypedCall(self.fmi, "Get", group) for group in groups]
+            self._lists[key] = self.fmi.bind([(one.function, one.arguments) for one in made]), made
+        bound, calls = self._lists[key]
+        return [np.array(one.buffer) for one in calls] if 0 <= bound.run() <= WARNING else []
