@@ -6,6 +6,7 @@ from .fmu_setup import FmuSetup
 from .instance import FmuInstance
 from .library_functions import LibraryFunctions, exported_name, list_prototypes
 from .loaded_fmu import LoadedFmu
+from .model_exchange_calls import order_questions
 from .model_exchange_instance import ModelExchangeInstance
 from .model_structure import is_smooth
 from .native_actions import NativeAction, NativeLook
@@ -42,4 +43,5 @@ __all__ = [
     "is_kept",
     "is_smooth",
     "list_prototypes",
+    "order_questions",
 ]

@@ -28,7 +28,6 @@ from .fmi_calls import FATAL, WARNING
 from .fmu_setup import FmuSetup
 from .loading import load_calls
 from .message_log import MessageLog, clean_text, describe_end
-from .model_exchange_calls import order_questions
 from .start_values import StartValues
 from .step_options import choose_modes
 from .text_values import (
@@ -356,33 +355,6 @@ class LoadedFmu:
         arguments = ([r for v in of for r in v.references], [r for v in by for r in v.references], changes, n)
         found = self.call("a directional derivative", self.fmi.directional_derivative, *arguments)
         return np.array(found, dtype=float)
-
-    def set_continuous_states(self, x: np.ndarray) -> None:
-        """Set all continuous states in model exchange, in the order of the description's `states`."""
-        given = x[np.array(self.description.state_order, dtype=int)]
-        self.call("setting the continuous states", self.fmi.set_continuous_states, given)
-
-    def rates_and_values(self, order: np.ndarray, rates: Sequence[str], names: Sequence[str]) -> np.ndarray:
-        """Return the derivatives of all states in model exchange, then the elements of variables.
-
-        Parameters
-        ----------
-        order : ndarray of int
-            Where the derivatives, as the FMU orders them, are in the result: the description's ``state_order``.
-        rates, names : sequence of str
-            Variables of the derivatives, and others to be read.
-        """
-        found = {"values": np.zeros(0), "rates": np.zeros(order.size)}
-
-        def read() -> None:
-            found["values"] = self.values(names or rates)
-
-        def derive() -> None:
-            found["rates"][order] = self.call("computing the derivatives", self.fmi.state_derivatives, order.size)
-
-        for ask in order_questions([read], [derive] if order.size else [], [read]):
-            ask()
-        return np.concatenate([found["rates"], found["values"] if names else np.zeros(0)])
 
     # ---- statuses of its calls, and values that don't fit ----
 

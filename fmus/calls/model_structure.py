@@ -45,7 +45,6 @@ def check_structure(
     function of t, x and u, with all smooth inputs set.
     """
     about = fmu.description
-    smooth = [port for port, v in fmu.inputs.items() if is_smooth(v)]
     key = about.digest, t, x.tobytes(), u.tobytes()
     if key in _CHECKED:
         for text in _CHECKED[key]:
@@ -57,18 +56,11 @@ def check_structure(
     rows = [fmu.setup.output_variables[p] for p in ports]
     rows += [about.find(name) for name in about.states.values()]
     columns: list[tuple[FmuVariable, str | None]] = [(about.find(name), None) for name in about.states]
-    columns += [(fmu.inputs[port], port) for port in smooth]
+    columns += [(v, port) for port, v in fmu.inputs.items() if is_smooth(v)]
     if not rows or not columns:
         return
     declared = np.block([[exchange.pattern(of, v) for v, _ in columns] for of in rows])
     evaluate = evaluation(Wanted(tuple(ports), bool(about.states)))
-    start = np.concatenate([x, *(u[places[port]] for _, port in columns if port is not None)])
-    nominals, low, high = (
-        np.concatenate([np.ravel(part) for part in parts])
-        for parts in zip(*((v.nominals, *v.limits) for v, _ in columns), strict=True)
-    )
-    step = _MOVED * np.maximum(np.abs(start), nominals) * np.random.default_rng(0).uniform(0.5, 1.0, start.size)
-    step = np.where(start + step <= high, step, np.where(start - step >= low, -step, 0.0))
 
     def values(moved: np.ndarray) -> np.ndarray:
         inputs, first = u.copy(), x.size
@@ -78,7 +70,52 @@ def check_structure(
                 first += v.size
         return evaluate(t, moved[: x.size], inputs).copy()
 
-    names = [label for v in rows for label in elements(v.name, v.shape)]
+    start = np.concatenate([x, *(u[places[port]] for _, port in columns if port is not None)])
+    step = _choose_steps([v for v, _ in columns], start)
+    names, knowns = (
+        [label for v in of for label in elements(v.name, v.shape)] for of in (rows, [v for v, _ in columns])
+    )
+    undeclared, drift = _find_undeclared(declared, values, start, step)
+    if undeclared is not None:
+        row, k, change = undeclared
+        raise FmuRuntimeError(
+            f"its model structure says that {names[row]!r} does not depend on {knowns[k]!r}; found a change of "
+            f"{change:.3g} where that moves by {step[k]:.3g}. The order of evaluation would be wrong. Take "
+            "interface='co_simulation' if it is offered, or dependencies='all', by which everything may depend on "
+            "everything, and report it to its makers.",
+            block=fmu.setup.label,
+            t=t,
+        )
+    notes = [
+        f"{names[row]!r} changes by itself: it differs by {drift[row]:.3g} between evaluations at one time, with "
+        "the same states and inputs, as a processor time or a random number does. Runs with it are not repeatable "
+        "where it is read, and its dependencies can't be checked"
+        for row in np.flatnonzero(drift)[:_MOST_NOTES]
+    ]
+    for text in notes:
+        fmu.add_note(text)
+    if len(_CHECKED) >= _MOST_CHECKED:
+        _CHECKED.clear()
+    _CHECKED[key] = notes
+
+
+def _choose_steps(variables: Sequence[FmuVariable], start: np.ndarray) -> np.ndarray:
+    """Return the distance by which each element is moved from a start, within its limits; 0 without room."""
+    nominals, low, high = (
+        np.concatenate([np.ravel(part) for part in parts])
+        for parts in zip(*((v.nominals, *v.limits) for v in variables), strict=True)
+    )
+    step = _MOVED * np.maximum(np.abs(start), nominals) * np.random.default_rng(0).uniform(0.5, 1.0, start.size)
+    return np.where(start + step <= high, step, np.where(start - step >= low, -step, 0.0))
+
+
+def _find_undeclared(
+    declared: np.ndarray, values: Callable[[np.ndarray], np.ndarray], start: np.ndarray, step: np.ndarray
+) -> tuple[tuple[int, int, float] | None, np.ndarray]:
+    """Return a value, an argument and the change for a dependency that isn't declared, or None; then drifts.
+
+    A drift is the distance of a value from an earlier one at the same arguments, 0 where there is none to speak of.
+    """
     base, again, whole = values(start), values(start), np.abs(values(start + step))
     least, drift = _SAME * (np.abs(base) + whole), np.abs(again - base)
     for pattern in np.unique(declared, axis=0)[:_MOST_PATTERNS]:
@@ -91,29 +128,10 @@ def check_structure(
         off &= ~(drift > least)
         if not off.any():
             continue
-        knowns = [label for v, _ in columns for label in elements(v.name, v.shape)]
         row = int(np.flatnonzero(off)[0])
         alone = (np.where(np.arange(start.size) == k, start + step, start) for k in np.flatnonzero(free))
         sizes = [abs(values(moved)[row] - base[row]) for moved in alone]
         values(start)
-        k = int(np.flatnonzero(free)[int(np.argmax(sizes))])
-        raise FmuRuntimeError(
-            f"its model structure says that {names[row]!r} does not depend on {knowns[k]!r}; found a change of "
-            f"{max(sizes):.3g} where that moves by {step[k]:.3g}. The order of evaluation would be wrong. Take "
-            "interface='co_simulation' if it is offered, or dependencies='all', by which everything may depend on "
-            "everything, and report it to its makers.",
-            block=fmu.setup.label,
-            t=t,
-        )
+        return (row, int(np.flatnonzero(free)[int(np.argmax(sizes))]), max(sizes)), drift
     values(start)
-    notes = [
-        f"{names[row]!r} changes by itself: it differs by {drift[row]:.3g} between evaluations at one time, with "
-        "the same states and inputs, as a processor time or a random number does. Runs with it are not repeatable "
-        "where it is read, and its dependencies can't be checked"
-        for row in np.flatnonzero(drift > least)[:_MOST_NOTES]
-    ]
-    for text in notes:
-        fmu.add_note(text)
-    if len(_CHECKED) >= _MOST_CHECKED:
-        _CHECKED.clear()
-    _CHECKED[key] = notes
+    return None, np.where(drift > least, drift, 0.0)

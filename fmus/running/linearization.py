@@ -15,7 +15,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, ParameterError, accepts, kinds
 from ...blocks.tracing import extrapolate
-from ..calls import FmuInstance, FmuSetup, LoadedFmu
+from ..calls import FmuInstance, FmuSetup, LoadedFmu, order_questions
 from .derivation import Derivation, DerivativeMethod
 from .difference_quotients import Column, Differences, differentiate
 from .fmu_point import FmuLinearization, FmuPoint, initialize_in_exchange, initialize_to_step, step_from, take_step
@@ -104,7 +104,13 @@ def _enter_continuous_time(point: FmuPoint, instance: LoadedFmu) -> None:
         where = point.about.layout(point.states).slices
         for name in guessed:
             x[where[name]] = np.ravel(point.given[name])
-        instance.set_continuous_states(x)
+        _set_states(point, instance, x)
+
+
+def _set_states(point: FmuPoint, instance: LoadedFmu, x: np.ndarray) -> None:
+    """Set all continuous states in model exchange."""
+    in_order = x[np.array(point.about.state_order, dtype=int)]
+    instance.call("setting the continuous states", instance.fmi.set_continuous_states, in_order)
 
 
 def _values(point: FmuPoint, instance: LoadedFmu) -> np.ndarray:
@@ -116,7 +122,17 @@ def _values(point: FmuPoint, instance: LoadedFmu) -> np.ndarray:
     rates = [point.about.states[n] for n in point.states]
     if not instance.model_exchange or len(order) != point.about.layout(point.states).total:
         return instance.values([*rates, *point.outputs])
-    return instance.rates_and_values(order, rates, point.outputs)
+    found = {"rates": np.zeros(order.size)}
+
+    def read() -> None:
+        found["values"] = instance.values(point.outputs or rates)
+
+    def derive() -> None:
+        found["rates"][order] = instance.call("computing the derivatives", instance.fmi.state_derivatives, order.size)
+
+    for ask in order_questions([read], [derive], [read]):
+        ask()
+    return np.concatenate([found["rates"], found["values"] if point.outputs else np.zeros(0)])
 
 
 def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLinearization:
@@ -182,7 +198,7 @@ def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray
     def values(moved: np.ndarray) -> np.ndarray:
         parts = layout.split(moved)
         if instance.model_exchange:
-            instance.set_continuous_states(moved[: sum(about.find(n).size for n in point.states)])
+            _set_states(point, instance, moved[: sum(about.find(n).size for n in point.states)])
             parts = {n: part for n, part in parts.items() if about.find(n).variability == "continuous"}
             parts = {n: part for n, part in parts.items() if n in point.moved}
         instance.call("setting its values", instance.set_values, parts)
@@ -247,7 +263,7 @@ def _differences(point: FmuPoint, instance: LoadedFmu, values: np.ndarray) -> Di
 
     def move(name: str, to: np.ndarray) -> None:
         if instance.model_exchange and name in point.states:
-            instance.set_continuous_states(to[: x.size])
+            _set_states(point, instance, to[: x.size])
         else:
             instance.set_values({name: column.part(name, to)})
 
