@@ -172,14 +172,14 @@ def _deciding_frequency(L: Any, quantity: str, value: float, name: str) -> float
     """Return the frequency in rad/s at which a margin is decided."""
     if quantity == "disk_margin":
         made = (disk_margin if L.ninputs == 1 else mimo_disk_margin)(L)
-        return _inside(made.frequency.value, L, name)
+        return _inside(made.frequency.value, L, quantity, name)
     found: Margins = margins(L)
     if quantity in ("ms", "modulus_margin"):
-        return _inside(found.ms_frequency.value, L, name)
+        return _inside(found.ms_frequency.value, L, quantity, name)
     if quantity == "mt":
-        return _inside(found.mt_frequency.value, L, name)
+        return _inside(found.mt_frequency.value, L, quantity, name)
     if quantity == "bandwidth":
-        return _inside(found.bandwidth.value, L, name)
+        return _inside(found.bandwidth.value, L, quantity, name)
     if quantity in ("gain_margin_low", "gain_margin_high"):
         near = _nearest(((c.frequency.value, c.gain_margin.value) for c in found.phase_crossovers), value)
     elif quantity == "phase_margin_deg":
@@ -191,7 +191,7 @@ def _deciding_frequency(L: Any, quantity: str, value: float, name: str) -> float
             for c in found.gain_crossovers
             if abs(np.radians(c.phase_margin_deg.value) % (2 * np.pi) / c.frequency.value - lag) <= 1e-9 * lag
         ]
-    return _inside(near[0] if near else math.nan, L, name)
+    return _inside(near[0] if near else math.nan, L, quantity, name)
 
 
 def _nearest(crossings: Iterable[tuple[float, float]], value: float) -> list[float]:
@@ -203,13 +203,14 @@ def _nearest(crossings: Iterable[tuple[float, float]], value: float) -> list[flo
     return [omega for off, omega in found[:1] if off <= SAME_MARGIN * abs(value)]
 
 
-def _inside(omega: float, L: Any, name: str) -> float:
+def _inside(omega: float, L: Any, quantity: str, name: str) -> float:
     """Return a frequency at which a sine can be injected."""
     top = 0.9 * np.pi / L.dt if L.dt else math.inf
     if not 0 < omega < math.inf:
+        other = "Simulate found.diagram" if quantity == "disk_margin" else "Take another number: quantity='disk_margin'"
         raise OptionError(
-            f"found a margin that is decided at {omega} rad/s; expected a frequency at which a sine can be added. Take "
-            "another number, such as quantity='disk_margin'.",
+            f"found {quantity!r}, which is decided at {omega} rad/s; expected a frequency at which a sine can be "
+            f"added. {other}.",
             block=name,
         )
     return min(omega, top)

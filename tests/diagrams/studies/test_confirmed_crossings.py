@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, Constant, TransferFunction
+from loopwright.blocks import PID, Constant, OptionError, TransferFunction
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.studies.confirmed_cases import _deciding_frequency
 from loopwright.frequency import margins
@@ -30,3 +30,12 @@ def test_a_crossing_is_found_by_its_margin_but_for_rounding(off):
     )
     expected = w[np.argmin(np.abs(angle + np.pi))]
     assert _deciding_frequency(L, "gain_margin_high", gain, "d") == pytest.approx(expected, 1e-4)
+
+
+@pytest.mark.parametrize(("quantity", "advice"), [("disk_margin", "Simulate found"), ("ms", "quantity='disk_margin'")])
+def test_a_number_without_a_frequency_has_another_next_step_for_a_disk_margin(quantity, advice):
+    """|S| of 0.5/(s + 1) comes to its largest value, 1, at infinity."""
+    lag = TransferFunction(numerator=[0.5], denominator=[1.0, 1.0], name="lag")
+    L = Diagram("lag", lag((-1.0 * lag.y).named("u"))).linearize().loop("u")
+    with pytest.raises(OptionError, match=f"found '{quantity}', which is decided at inf rad/s; .*{advice}"):
+        _deciding_frequency(L, quantity, margins(L).numbers()[quantity].value, "lag")
