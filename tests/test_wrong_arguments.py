@@ -294,10 +294,10 @@ def test_a_misspelt_text_is_told_with_the_right_one(name, argument, misspelt, ri
 
 def test_a_drawing_of_a_subsystem_counts_the_blocks_in_it(monkeypatch):
     """Beyond some number of blocks subsystems are drawn closed: of those that are drawn."""
-    from loopwright.diagrams.drawing import svg
+    from loopwright.diagrams.drawing import diagram_picture
     from support.public_calls import drive
 
-    monkeypatch.setattr(svg, "MANY", 5)  # the diagram has 7 blocks, its subsystem 4
+    monkeypatch.setattr(diagram_picture, "MANY", 5)  # the diagram has 7 blocks, its subsystem 4
     assert isinstance(drive(), Diagram)
-    assert svg.find_closed(drive().structure, "", None, diagram="d") == {"control"}
-    assert svg.find_closed(drive().structure, "control", None, diagram="d") == set()
+    assert diagram_picture.find_closed(drive().structure, "", None, diagram="d") == {"control"}
+    assert diagram_picture.find_closed(drive().structure, "control", None, diagram="d") == set()

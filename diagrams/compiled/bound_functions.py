@@ -12,7 +12,6 @@ from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
 
-from ...blocks.core import CompilerError
 from ...blocks.interrupts import INTERRUPTS
 from ..flat import bind_function
 from .machine import MachineProgram, make_program
@@ -197,10 +196,6 @@ class CodeOfFunctions(ABC):
     def find(self, function: Any) -> CompiledFunction:
         """Return a CasADi function as C calls it."""
 
-    @abstractmethod
-    def address(self, name: str) -> int:
-        """Return the address of a C function that was generated."""
-
 
 @dataclass(frozen=True, eq=False)
 class GeneratedCode(CodeOfFunctions):
@@ -227,10 +222,6 @@ class Machine(CodeOfFunctions):
         if (program := _PROGRAMS[function]) is None:
             return CalledFunction(function, 0)
         return MachineFunction(function, address_of(self.library, "loopwright_machine"), program)
-
-    def address(self, name: str) -> int:
-        """Refuse functions that there is only generated code of."""
-        raise CompilerError(f"{name} needs generated code.")
 
 
 _PROGRAMS: WeakKeyDictionary[Any, MachineProgram | None] = WeakKeyDictionary()

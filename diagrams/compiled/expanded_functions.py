@@ -100,8 +100,9 @@ class ExpandedFunctions(_Traced):
 
     def find_steps(self, code: CodeOfFunctions) -> Mapping[str, int]:
         """Return the addresses of generated steps, by method."""
-        has_steps = isinstance(code, GeneratedCode) and self._steps
-        return {method: code.address(step) for method, step in STEPS.items()} if has_steps else {}
+        if not isinstance(code, GeneratedCode) or not self._steps:
+            return {}
+        return {method: code.address(step) for method, step in STEPS.items()}
 
     @cached_property
     def operations_of_rates(self) -> int:

@@ -48,10 +48,6 @@ class NamedCode(CodeOfFunctions):
         self.functions.append(share_terms(function, f"lw_of_{function.name()}"))
         return CompiledFunction(self.functions[-1], _FIRST + 16 * len(self.functions))
 
-    def address(self, name: str) -> int:
-        """Return no address: C finds what it needs by its name."""
-        return 0
-
     def name_of(self, address: int) -> str | None:
         """Return the name of a function by the number in place of its address."""
         place = (address - _FIRST) // 16 - 1

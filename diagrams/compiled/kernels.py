@@ -16,7 +16,7 @@ import numpy as np
 
 from ...blocks.core import CompilerError
 from ..flat import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE, TRUE_OF, FlatDiagram, Program
-from .bound_functions import CodeOfFunctions, Machine, operation_names
+from .bound_functions import CodeOfFunctions, GeneratedCode, operation_names
 from .generated_text import BODY, READ, WRITE
 from .machine import BlockProgram, make_program
 
@@ -76,7 +76,7 @@ class BlockKinds:
 
     def find(self, code: CodeOfFunctions) -> Kernels:
         """Return the kernels: in a library of generated code, or for the virtual machine."""
-        if not isinstance(code, Machine):
+        if isinstance(code, GeneratedCode):
             return Kernels(self._generated[1], self._opaque, code.address(_TABLE))
         if self._on_machine is None:
             self._on_machine = self._make_programs(operation_names(code.library))

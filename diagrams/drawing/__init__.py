@@ -1,8 +1,8 @@
 """Drawings of diagrams."""
 
-from .box_order import Node, Pin
 from .drawing import Drawing, draw
 from .drawing_layout import Net, arrange
+from .layers import Node, Pin
 from .live import Facts, RecordedSignal
 from .printer import printer
 

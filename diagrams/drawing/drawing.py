@@ -10,9 +10,9 @@ from pathlib import Path
 
 from ...blocks.core import OptionError, accepts, check_file, explain_calls, kinds, write_text
 from ..wiring import Structure
+from .diagram_picture import WIDTH, DiagramPicture, find_closed
 from .live import Facts, live_html
 from .printer import printer
-from .svg import WIDTH, DiagramPicture, find_closed
 
 SCALE = 2
 """Pixels of a PNG for each pixel of the drawing."""

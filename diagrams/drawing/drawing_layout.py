@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from .box_order import Node, Pin, cut_loops, order_layers, place_layers
+from .layers import Node, Pin, cut_loops, order_layers, place_layers
 
 GAP, LANE, TRACK, LEAST = 22.0, 12.0, 9.0, 26.0
 """Between nodes; around a wire that passes a layer; between parallel wires; the narrowest channel."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from ...blocks.core import PortUnit, shorten
 from ..wiring import Structure
-from .svg import DiagramPicture
+from .diagram_picture import DiagramPicture
 
 MOST_SUBSYSTEMS = 4
 """Number of subsystems up to which every combination of open ones is drawn ahead."""

@@ -6,7 +6,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from ..wiring import Structure, Wire
-from .box_order import Pin
+from .layers import Pin
 
 
 class Border(Enum):

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
-from .box_order import Node, Pin
 from .drawing_layout import GAP, LANE, TRACK, Net, arrange
+from .layers import Node, Pin
 
 SLACK = 1.2
 """Factor by which a drawing may be wider than asked for: a page shows it that much smaller."""
@@ -90,23 +91,64 @@ def _find_rows(nodes: Sequence[Node], nets: Sequence[Net], limit: float) -> dict
     return {n.key: sum(layers.index(n.layer) >= start for start in starts) - 1 for n in nodes}
 
 
+class _Crossing(NamedTuple):
+    """A net between rows."""
+
+    net: Net
+    home: _Row | None  # the row that it leaves; None if its source is on the border
+    others: list[_Row]  # those that it enters
+
+
+class _BorderPin(NamedTuple):
+    """A pin on the border of the subsystem whose inside is laid out, and where its net ends in a row."""
+
+    node: Node
+    row: _Row
+    net: Net
+
+    @property
+    def end(self) -> Node:
+        ends = self.row.entries if self.node.side < 0 else self.row.exits
+        return ends[self.net.key]
+
+
 def _stack(nodes: Sequence[Node], nets: Sequence[Net], row_of: dict[str, int]) -> tuple[float, float]:
+    """Lay out rows one below the other, and join what is wired between them; return the width and height."""
+    rows, crossing, pins = _split(nodes, nets, row_of)
+    left = (len(crossing) - 1) * TRACK + 2 * LANE if crossing else 0.0
+    _place(rows, crossing)
+    for row in rows:
+        for node in (*row.nodes, *row.entries.values(), *row.exits.values()):
+            node.x, node.y = node.x + left, node.y + row.y
+        for net, part in row.nets:
+            net.runs += [[(x + left, y + row.y) for x, y in run] for run in part.runs]
+            net.dots += [(x + left, y + row.y) for x, y in part.dots]
+    _connect(crossing, left, {id(pin.net) for pin in pins})
+    width = max([left + row.width for row in rows] + [x for net in nets for run in net.runs for x, _ in run])
+    _join_border(nodes, pins, width)
+    if any(node.side > 0 for node in nodes):
+        width += LANE
+    return width, rows[-1].y + rows[-1].height + _strip(rows[-1], crossing)
+
+
+def _split(
+    nodes: Sequence[Node], nets: Sequence[Net], row_of: dict[str, int]
+) -> tuple[list[_Row], list[_Crossing], list[_BorderPin]]:
+    """Return the rows with their nodes and parts of nets, the nets between rows, and the pins on the border."""
     by_key = {node.key: node for node in nodes}
     rows = [_Row() for _ in range(max(row_of.values()) + 1)]
     for node in nodes:
         if not node.side:
             rows[row_of[node.key]].nodes.append(node)
-    crossing, at_border = [], []
+    crossing, pins = list[_Crossing](), list[_BorderPin]()
     for net in nets:
         source = by_key[net.source[0]]
         ends = [(by_key[key], pin) for key, pin in net.sinks]
         behind = sorted({row_of[node.key] for node, _ in ends if not node.side})
         border = [node for node, _ in ends if node.side]
         home = row_of[source.key] if not source.side else behind[0] if behind else 0
-        if source.side:
-            at_border.append((source, rows[home], net, -1))
-        at_border += [(node, rows[home], net, 1) for node in border]
-        # in each row such a net is a separate part, from or to a pin at the row's border; `_connect` joins the parts
+        pins += [_BorderPin(node, rows[home], net) for node in ([source] if source.side else []) + border]
+        # In each row such a net is a separate part, from or to a pin at the row's border; `_connect` joins the parts.
         across = [row for row in behind if row != home]
         for row in sorted({home, *across}):
             here = [(node.key, pin) for node, pin in ends if not node.side and row_of[node.key] == row]
@@ -116,34 +158,21 @@ def _stack(nodes: Sequence[Node], nets: Sequence[Net], row_of: dict[str, int]) -
             part = Net(f"{net.key} {row}", start, here, net.label if start is net.source else 0.0)
             rows[row].nets.append((net, part))
         if across:
-            crossing.append((net, None if source.side else rows[home], [rows[home]] * bool(source.side)))
-            crossing[-1][2].extend(rows[row] for row in across)
-    left = (len(crossing) - 1) * TRACK + 2 * LANE if crossing else 0.0
-    _place(rows, crossing)
-    for line in rows:
-        for node in (*line.nodes, *line.entries.values(), *line.exits.values()):
-            node.x, node.y = node.x + left, node.y + line.y
-        for net, part in line.nets:
-            net.runs += [[(x + left, y + line.y) for x, y in run] for run in part.runs]
-            net.dots += [(x + left, y + line.y) for x, y in part.dots]
-    _connect(crossing, left, {id(net) for _, _, net, _ in at_border})
-    width = max(
-        [left + row.width for row in rows] + [x for net in nets for run in net.runs for x, _ in run],
-    )
+            others = [rows[row] for row in across]
+            from_border = _Crossing(net, None, [rows[home], *others])
+            crossing.append(from_border if source.side else _Crossing(net, rows[home], others))
+    return rows, crossing, pins
+
+
+def _join_border(nodes: Sequence[Node], pins: Sequence[_BorderPin], width: float) -> None:
+    """Place the pins on the border at the heights at which their nets end in the rows, and draw the wires to them."""
     for node in nodes:
         node.x = 0.0 if node.side < 0 else width + LANE if node.side > 0 else node.x
-    for node, home_row, net, side in at_border:
-        end = home_row.entries[net.key] if side < 0 else home_row.exits[net.key]
+    for pin in pins:
+        node, end = pin.node, pin.end
         node.y = end.y
         run = [(node.x, node.y), (end.x, end.y)]
-        net.runs.append(run if side < 0 else run[::-1])
-    if any(node.side > 0 for node in nodes):
-        width += LANE
-    return width, rows[-1].y + rows[-1].height + _strip(rows[-1], crossing)
-
-
-_Crossing = tuple[Net, _Row | None, list[_Row]]
-"""A net between rows: the row that it leaves, if its source isn't on the border, and the rows that it enters."""
+        pin.net.runs.append(run if node.side < 0 else run[::-1])
 
 
 def _leaving(row: _Row, crossing: Sequence[_Crossing]) -> list[Net]:

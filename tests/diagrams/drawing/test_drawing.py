@@ -13,8 +13,8 @@ import pytest
 
 from loopwright.blocks import PID, Gain, Integrator, OptionError, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.drawing.box_order import Node, cut_loops
 from loopwright.diagrams.drawing.drawing_layout import Net, _assign_tracks, _draw, _Part, arrange
+from loopwright.diagrams.drawing.layers import Node, cut_loops
 from loopwright.diagrams.drawing.rows import arrange_in_rows
 from loopwright.fmus import Fmu, dc_motor
 

@@ -1,4 +1,4 @@
-"""The drawing of a diagram, as SVG, made from the diagram itself."""
+"""The picture of a diagram: its blocks and subsystems, laid out from the inside out, and drawn as SVG."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import NamedTuple
 from ...blocks import PID
 from ...blocks.core import OptionError, Sum, near
 from ..wiring import Structure, stepped_blocks
-from .box_order import Node, Pin
 from .drawing_layout import Net
+from .layers import Node, Pin
 from .nets import Border, Nets, PinPlace
 from .rows import arrange_in_rows
 from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, style, text_at, width_of

@@ -1,4 +1,4 @@
-"""Order of a drawing: wires that close loops, positions in a layer, and heights."""
+"""Layers of a drawing: wires that close loops, positions in a layer, and heights."""
 
 from __future__ import annotations
 
