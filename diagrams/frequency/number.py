@@ -188,8 +188,9 @@ def with_findings(value: R, findings: tuple[Finding, ...]) -> R:
 def _add(value: Any, findings: tuple[Finding, ...]) -> Any:
     from control import StateSpace
 
-    if isinstance(value, Number):
-        return replace(value, findings=_join(value.findings, tuple(f for f in findings if f.limits_numbers)))
+    if isinstance(value, Number):  # one that has them already stays itself: tables and paths find it by its identity
+        joined = _join(value.findings, tuple(f for f in findings if f.limits_numbers))
+        return value if joined == value.findings else replace(value, findings=joined)
     if isinstance(value, StateSpace):
         value.findings = _join(findings_of(value), findings)
         return value

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
 from ...blocks.core import print_unit
 from ..frequency import Number
-from .verdicts import Limit, Reason, Verdict, unit_of
+from .verdicts import Limit, Reason, Verdict, judge, unit_of
 
 
 class StepSize(StrEnum):
@@ -25,7 +25,7 @@ class StepSize(StrEnum):
 
 @dataclass(frozen=True)
 class RequirementResult:
-    """A requirement with its verdict.
+    """A requirement with its verdict, which is open, as there is no number, until one is judged.
 
     Attributes
     ----------
@@ -64,8 +64,8 @@ class RequirementResult:
     loop: str
     variant: str
     limit: Limit
-    verdict: Verdict
-    reason: Reason
+    verdict: Verdict = Verdict.UNDECIDED
+    reason: Reason = Reason.NO_NUMBER
     distance: float = math.nan
     path: str = ""
     number: Number | None = None
@@ -80,6 +80,19 @@ class RequirementResult:
     def __post_init__(self) -> None:
         unit = self.unit or unit_of(self.quantity) if self.number is None else self.number.unit
         object.__setattr__(self, "unit", unit)
+
+    def judged(self, number: Number, path: str = "") -> RequirementResult:
+        """Return the result with the verdict on a number."""
+        verdict, reason, distance = judge(number, self.limit)
+        return replace(self, verdict=verdict, reason=reason, distance=distance, number=number, path=path)
+
+    def failed(self, reason: Reason, detail: str = "") -> RequirementResult:
+        """Return the result as one that fails for a reason."""
+        return replace(self, verdict=Verdict.FAILED, reason=reason, detail=detail)
+
+    def undecided(self, reason: Reason, detail: str = "") -> RequirementResult:
+        """Return the result as one that is open for a reason."""
+        return replace(self, verdict=Verdict.UNDECIDED, reason=reason, detail=detail)
 
     @property
     def required(self) -> str:

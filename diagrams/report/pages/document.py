@@ -71,6 +71,19 @@ class TableForm:
         )
 
 
+def compare_columns(
+    title: str,
+    names: Mapping[str, str],
+    columns: Iterable[tuple[str, Mapping[str, Any]]],
+    note: str = "",
+    **options: Any,
+) -> Table:
+    """Return a table with a row for each name, in words, and a column for each heading with its values by name."""
+    pairs = list(columns)
+    rows = tuple((words, *(values.get(name) for _, values in pairs)) for name, words in names.items())
+    return Table(title, ("", *(heading for heading, _ in pairs)), rows, note, **options)
+
+
 class Judged(str):
     """A text that is shown in the color of its verdict: a cell of a table, or a paragraph.
 

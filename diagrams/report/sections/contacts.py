@@ -14,7 +14,7 @@ from ....blocks.core import ConfirmationError, Finding, LoopwrightError, OptionE
 from ...contact import Contact, ContactConfirmation, ContactLimit, Passivity, try_limit
 from ...flat import WiredDiagram
 from ...frequency import Number, with_findings
-from ...requirements import ContactLimits, Reason, RequirementResult, Requirements, TomlFile, Verdict, judge
+from ...requirements import ContactLimits, Reason, RequirementResult, Requirements, TomlFile
 from ...studies import ContactTask
 from .. import figures
 from ..content_hash import content_hash
@@ -209,20 +209,16 @@ class ReportedContacts:
             for one in self.limits.get("", ()):
                 for vary, limit in one.limits.items():
                     name = f"{KEY}.{vary}"
-                    yield RequirementResult(name, "", KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER, unit=UNITS[vary])
+                    yield RequirementResult(name, "", KEY, limit, unit=UNITS[vary])
         for name in self.contacts:
             for one in self.limits_of(name):
                 for vary, limit in one.limits.items():
                     path = f"{KEY}.{name}.{LIMITS[vary]}.{_place(vary, one.environment)}"
-                    result = RequirementResult(
-                        f"{KEY}.{vary}", name, KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER, unit=UNITS[vary]
-                    )
+                    result = RequirementResult(f"{KEY}.{vary}", name, KEY, limit, unit=UNITS[vary])
                     if path in numbers:
-                        verdict, reason, distance = judge(numbers[path], limit)
-                        if path in self.refuted:
-                            verdict, reason = Verdict.UNDECIDED, Reason.REFUTED
-                        result = replace(result, verdict=verdict, reason=reason, distance=distance, path=path)
-                        result = replace(result, number=numbers[path], detail=_describe(one.environment))
+                        result = result.judged(numbers[path], path)
+                        result = result.undecided(Reason.REFUTED) if path in self.refuted else result
+                        result = replace(result, detail=_describe(one.environment))
                     yield result
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from ...wiring import join
 from .. import figures
 from ..case import Case
 from ..error_sentences import say, say_found
-from ..pages import Plot, Section, Table, Texts
+from ..pages import Plot, Section, Table, TableForm, Texts, compare_columns
 from ..same_loops import find_same
 from ..variant import Cut, Variant, in_s
 from ..wires_on_loops import blocks_on_loops
@@ -63,8 +64,6 @@ PEAKS = ("ms", "mt")
 """The numbers that say how much an error of L is amplified."""
 LINEAR = 1e-3
 """A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""
-RIGHT = 5
-"""Column of the comparison with python-control that says whose number is right."""
 POINTS = 400
 WHOLE = 1e-6
 """Relative deviation of PS·CS from S·T below which the loop goes through both wires."""
@@ -111,118 +110,174 @@ def _with_figures(case: Case, key: str, section: Section, drawn: figures.DrawnLo
     return replace(section, plots=plots, overview=overview)
 
 
+@dataclass(frozen=True)
+class VariantLoop:
+    """The loop at a wire in a variant: its margins, those over the whole period, and those of python-control."""
+
+    variant: Variant
+    cut: Cut
+    title: str
+    L: Any
+    margins: Margins
+    periodic: PeriodicMargins | None  # of a loop whose slower loops are open in ``margins``
+    theirs: tuple[Comparison, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """Its part of dotted paths."""
+        return cut_key(self.variant, self.cut)
+
+    @cached_property
+    def own(self) -> dict[Cut, dict[str, Number]]:
+        """The numbers of its margins by the ends of their paths, in each way in which it is cut."""
+        m, p = self.margins, self.periodic
+        found = {self.cut: with_findings(_numbers(m, self.L), m.findings)}
+        return found if p is None else {**found, Cut.PERIODIC: with_findings(_periodic_numbers(p), p.findings)}
+
+    @property
+    def numbers(self) -> dict[str, Number]:
+        """All its numbers by their paths behind the loop's key."""
+        found = {
+            f"{cut_key(self.variant, cut)}.{name}": number
+            for cut, numbers in self.own.items()
+            for name, number in numbers.items()
+        }
+        m = self.margins
+        return found | {f"{self.key}.control.{c.name}": with_findings(_theirs(m, c), m.findings) for c in self.theirs}
+
+
+CROSSINGS = TableForm(
+    "Crossings at {wire}",
+    {"variant": "variant", "crossing of": "kind", "frequency": "frequency", "margin there": "margin"},
+    details=True,
+)
+CLOSED_LOOP_POLES = TableForm(
+    "Closed-loop poles of the loop at {wire}",
+    {
+        "variant": "variant",
+        "poles, s = log(z)/T where sampled [1/s]": "poles",
+        "hidden: not in this loop": "hidden",
+    },
+    details=True,
+)
+COMPARED = TableForm(
+    "Margins at {wire} next to python-control's own values",
+    {
+        "variant": "variant",
+        "number": "name",
+        "here": "value",
+        "python-control": "control",
+        "its function": "function",
+        "right": "right",
+        "why": "why",
+    },
+    details=True,
+)
+DISKS = TableForm(
+    "MIMO disk margin at {wire}",
+    {"variant": "variant", "α": "alpha", "at": "frequency", "gains and phase of all entries at once": "range"},
+)
+
+
 def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
-    own: dict[tuple[Variant, Cut], Mapping[str, Number]] = {}
-    found: dict[str, Margins] = {}
-    loops: dict[str, Any] = {}
-    titles: dict[str, str] = {}
-    designs: list[str] = []
-    periodic: dict[str, PeriodicMargins] = {}
-    notes: list[str] = []
-    numbers: dict[str, Number] = {}
-    beside: list[tuple[Any, ...]] = []
-    absent: dict[str, str] = {}
+    """Return the section of the loop at a wire; None where no variant has one."""
+    loops, notes, absent = list[VariantLoop](), list[str](), dict[str, str]()
     for v in case.usable():
         case.notify(f"margins at {wire}, {v.title}")
         try:
             cut, title, L = v.fullest_loop(wire)
             if L.ninputs > 1:
                 return several(case, key, wire)
-            m = margins(L)
+            loops.append(_analyse(case, wire, v, cut, title, L))
+            notes += loops[-1].notes
         except LoopwrightError as error:
             notes.append(_no_margins(wire, v, error))
             absent[v.key] = error.what_was_found
-            continue
-        at = cut_key(v, cut)
-        found[at], loops[at], titles[at] = m, L, title
-        designs += [at] if v.is_design or v.is_actual else []
-        own[v, cut] = with_findings(_numbers(m, L), m.findings)
-        numbers |= {f"{at}.{name}": number for name, number in own[v, cut].items()}
-        low, high = m.gain_margin_low.value, m.gain_margin_high.value
-        # stairs act with up to 4/π times their mean slope, and with none: a margin within that may be a limit cycle
-        if (high < STEEPEST or low > 0.0) and any(isinstance(f, MeanSlope) for f in m.findings):
-            notes.append(TEXTS.line("limit_cycle", variant=title, high=high if high < STEEPEST else 0.0, low=low))
-        if m.hidden_unstable:
-            shown = _poles(m.hidden_unstable, L.dt)
-            notes.append(TEXTS.line("hidden_unstable", variant=title, poles=shown))
-        # loops of slower subsystems are open in the margins above, and closed in those over the whole period
-        if cut is Cut.SLOW_OPEN:
-            try:
-                p = periodic_margins(v.loop(wire, cut=Cut.PERIODIC))
-            except LoopwrightError as error:
-                notes.append(f"{v.title}: {say(error)}")
-            else:
-                periodic[v.title] = p
-                own[v, Cut.PERIODIC] = with_findings(_periodic_numbers(p), p.findings)
-                where = cut_key(v, Cut.PERIODIC)
-                numbers |= {f"{where}.{name}": number for name, number in own[v, Cut.PERIODIC].items()}
-                if not p.stable:
-                    shown = _poles(p.unstable_poles, p.dt)
-                    notes.append(TEXTS.line("unstable", variant=v.title, poles=shown))
-        if not m.stable:
-            notes.append(TEXTS.line("unstable", variant=title, poles=_poles(m.unstable_poles, L.dt)))
-        # python-control is asked about the design alone: a stable, rational loop, as its functions know no other
-        elif v.is_design and isinstance(L, delayed_system_class()):
-            notes.append(TEXTS.line("no_rational_model", variant=title))
-        elif v.is_design:
-            case.notify(f"confirming the margins at {wire}, {v.title}")
-            try:
-                with np.errstate(all="ignore"):
-                    r = Realization.of(L)
-                    rows = compare_margins(r, m, _as_control(r))
-            except (LoopwrightError, np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
-                notes.append(TEXTS.line("not_compared", variant=title, error=str(error)))
-                continue
-            for c in rows:
-                numbers[f"{at}.control.{c.name}"] = with_findings(_theirs(m, c), m.findings)
-                beside.append((title, c.name, c.value, c.control, c.function, c.right, c.why))
-    if not found:
+    if not loops:
         return None
-    notes = [*_other_cuts(case, case.loop_places[key]), *notes] if key in case.loop_places else notes
-    if periodic:
-        notes += TEXTS.paragraphs("periodic", wire=wire)
-    tables = [
-        Table(
-            f"Margins at {wire}",
-            ("", *(titles[k] for k in found)),
-            tuple(
-                (text, *(m.numbers()[name] for m in found.values()))
-                for name, text in ROWS.items()
-                if name != "delay_margin_samples" or any(L.dt for L in loops.values())
-            ),
-        ),
-        Table(
-            f"Crossings at {wire}",
-            ("variant", "crossing of", "frequency", "margin there"),
-            tuple(_crossings(found, titles)),
-            details=True,
-        ),
-        Table(
-            f"Closed-loop poles of the loop at {wire}",
-            ("variant", "poles, s = log(z)/T where sampled [1/s]", "hidden: not in this loop"),
-            tuple(
-                (titles[k], _poles(m.closed_loop_poles, loops[k].dt), _poles(m.hidden_poles, loops[k].dt))
-                for k, m in found.items()
-            ),
-            "Multiple poles scatter, as ε^(1/multiplicity).",
-            details=True,
-        ),
+    periodic = [of for of in loops if of.periodic is not None]
+    text = [
+        *(_other_cuts(case, case.loop_places[key]) if key in case.loop_places else ()),
+        *notes,
+        *(TEXTS.paragraphs("periodic", wire=wire) if periodic else ()),
     ]
-    if periodic:
-        tables.append(_periodic_table(wire, periodic))
-    if beside:
-        columns = ("variant", "number", "here", "python-control", "its function", "right", "why")
-        title = f"Margins at {wire} next to python-control's own values"
-        differing = tuple(row for row in beside if row[RIGHT] != "both")
-        note = TEXTS.line("agreeing", count=len(beside) - len(differing))
-        if differing:
-            tables.append(Table(title, columns, differing, note, details=True))
-    plain = {at: loops[at] for at in designs}
-    looks = {at: case.looks[at.partition(".")[0]] for at in designs}
-    drawn = figures.DrawnLoops(wire, plain, found, titles, looks, case.axes)
-    return LoopPart(
-        Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), (), numbers, absent=absent), own, drawn
+    numbers = {path: number for of in loops for path, number in of.numbers.items()}
+    section = Section(key, f"Loop at {wire}", tuple(text), tuple(_tables(wire, loops)), (), numbers, absent=absent)
+    own = {(of.variant, cut): found for of in loops for cut, found in of.own.items()}
+    shown = {of.key: of for of in loops if of.variant.is_design or of.variant.is_actual}
+    drawn = figures.DrawnLoops(
+        wire,
+        {at: of.L for at, of in shown.items()},
+        {of.key: of.margins for of in loops},
+        {of.key: of.title for of in loops},
+        {at: case.looks[of.variant.key] for at, of in shown.items()},
+        case.axes,
     )
+    return LoopPart(section, own, drawn)
+
+
+def _analyse(case: Case, wire: str, v: Variant, cut: Cut, title: str, L: Any) -> VariantLoop:
+    """Return the loop at a wire in a variant with its margins, and what there is to say of them."""
+    m = margins(L)
+    periodic, theirs, notes = None, tuple[Comparison, ...](), list[str]()
+    low, high = m.gain_margin_low.value, m.gain_margin_high.value
+    # stairs act with up to 4/π times their mean slope, and with none: a margin within that may be a limit cycle
+    if (high < STEEPEST or low > 0.0) and any(isinstance(f, MeanSlope) for f in m.findings):
+        notes.append(TEXTS.line("limit_cycle", variant=title, high=high if high < STEEPEST else 0.0, low=low))
+    if m.hidden_unstable:
+        notes.append(TEXTS.line("hidden_unstable", variant=title, poles=_poles(m.hidden_unstable, L.dt)))
+    # loops of slower subsystems are open in the margins above, and closed in those over the whole period
+    if cut is Cut.SLOW_OPEN:
+        try:
+            periodic = periodic_margins(v.loop(wire, cut=Cut.PERIODIC))
+        except LoopwrightError as error:
+            notes.append(f"{v.title}: {say(error)}")
+    if periodic is not None and not periodic.stable:
+        shown = _poles(periodic.unstable_poles, periodic.dt)
+        notes.append(TEXTS.line("unstable", variant=v.title, poles=shown))
+    # python-control is asked about the design alone: a stable, rational loop, as its functions know no other
+    if not m.stable:
+        notes.append(TEXTS.line("unstable", variant=title, poles=_poles(m.unstable_poles, L.dt)))
+    elif v.is_design and isinstance(L, delayed_system_class()):
+        notes.append(TEXTS.line("no_rational_model", variant=title))
+    elif v.is_design:
+        case.notify(f"confirming the margins at {wire}, {v.title}")
+        try:
+            with np.errstate(all="ignore"):
+                r = Realization.of(L)
+                theirs = compare_margins(r, m, _as_control(r))
+        except (LoopwrightError, np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
+            notes.append(TEXTS.line("not_compared", variant=title, error=str(error)))
+    return VariantLoop(v, cut, title, L, m, periodic, theirs, tuple(notes))
+
+
+def _tables(wire: str, loops: Sequence[VariantLoop]) -> Iterator[Table]:
+    """Yield the tables of the loop at a wire: its margins, and the details of the appendix."""
+    sampled = any(of.L.dt for of in loops)
+    names = {name: words for name, words in ROWS.items() if sampled or name != "delay_margin_samples"}
+    yield compare_columns(f"Margins at {wire}", names, [(of.title, of.margins.numbers()) for of in loops])
+    yield CROSSINGS.fill((row for of in loops for row in _crossings(of)), wire=wire)
+    poles = (
+        {
+            "variant": of.title,
+            "poles": _poles(of.margins.closed_loop_poles, of.L.dt),
+            "hidden": _poles(of.margins.hidden_poles, of.L.dt),
+        }
+        for of in loops
+    )
+    yield CLOSED_LOOP_POLES.fill(poles, "Multiple poles scatter, as ε^(1/multiplicity).", wire=wire)
+    periodic = [(of.variant.title, of.periodic) for of in loops if of.periodic is not None]
+    if periodic:
+        every = {**ROWS, "disk_frequency": "disk margin at"}
+        names = {name: words for name, words in every.items() if name in PERIODIC}
+        note = TEXTS.line("renewals", renewals=list(dict.fromkeys((p.renewals, p.dt) for _, p in periodic)))
+        columns = [(title, p.numbers()) for title, p in periodic]
+        yield compare_columns(f"Periodic loop at {wire}, all loops closed", names, columns, note)
+    compared = [{"variant": of.title, **vars(c)} for of in loops for c in of.theirs]
+    differing = [row for row in compared if row["right"] != "both"]
+    if differing:
+        yield COMPARED.fill(differing, TEXTS.line("agreeing", count=len(compared) - len(differing)), wire=wire)
 
 
 def _other_cuts(case: Case, place: LoopPlace) -> list[str]:
@@ -275,15 +330,6 @@ def _periodic_numbers(p: PeriodicMargins) -> dict[str, Number]:
     return {**p.numbers(), "stable": Number(float(p.stable), "1", 0.0, "closed-loop eigenvalues of the lifted system")}
 
 
-def _periodic_table(wire: str, periodic: Mapping[str, PeriodicMargins]) -> Table:
-    """Return the margins of a wire with all loops closed, one factor at all its renewals."""
-    names = {**ROWS, "disk_frequency": "disk margin at"}
-    rows = [(text, *(p.numbers()[name] for p in periodic.values())) for name, text in names.items() if name in PERIODIC]
-    renewals = {title: (p.renewals, p.dt) for title, p in periodic.items()}
-    note = TEXTS.line("renewals", renewals=list(dict.fromkeys(renewals.values())))
-    return Table(f"Periodic loop at {wire}, all loops closed", ("", *periodic), tuple(rows), note)
-
-
 def _as_control(r: Realization) -> Any:
     """Return the loop without hidden modes, as python-control is given it."""
     import control
@@ -297,12 +343,12 @@ def _theirs(m: Margins, c: Comparison) -> Number:
     return Number(c.control, unit, error, f"python-control's {c.function}; right: {c.right}; {c.why}")
 
 
-def _crossings(found: Mapping[str, Margins], titles: Mapping[str, str]) -> Iterable[tuple[Any, ...]]:
-    for key, m in found.items():
-        for c in m.gain_crossovers:
-            yield titles[key], "|L| = 1", c.frequency, c.phase_margin_deg
-        for p in m.phase_crossovers:
-            yield titles[key], "L < 0", p.frequency, p.gain_margin
+def _crossings(of: VariantLoop) -> Iterator[dict[str, Any]]:
+    """Yield the facts of `CROSSINGS` of a loop."""
+    for c in of.margins.gain_crossovers:
+        yield {"variant": of.title, "kind": "|L| = 1", "frequency": c.frequency, "margin": c.phase_margin_deg}
+    for p in of.margins.phase_crossovers:
+        yield {"variant": of.title, "kind": "L < 0", "frequency": p.frequency, "margin": p.gain_margin}
 
 
 def _poles(poles: Iterable[complex], dt: float) -> str:
@@ -481,13 +527,11 @@ def several(case: Case, key: str, wire: str) -> LoopPart | None:
             notes.append(f"{v.title}: {say(error)}")
             continue
         own[v, cut] = disk_numbers(disk)
-        rows.append((title, disk.alpha, disk.frequency, disk_range(disk)))
+        facts = {"alpha": disk.alpha, "frequency": disk.frequency, "range": disk_range(disk)}
+        rows.append({"variant": title, **facts})
     if not rows:
         return None
-    table = Table(
-        f"MIMO disk margin at {wire}", ("variant", "α", "at", "gains and phase of all entries at once"), tuple(rows)
-    )
-    part = LoopPart(Section(key, f"Loops at {wire}", tuple(notes), (table,)), own)
+    part = LoopPart(Section(key, f"Loops at {wire}", tuple(notes), (DISKS.fill(rows, wire=wire),)), own)
     return replace(part, section=replace(part.section, numbers=part.by_path))
 
 

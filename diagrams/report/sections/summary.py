@@ -28,7 +28,7 @@ from ...studies import CaseState
 from ..case import Case
 from ..case_verdicts import weakest
 from ..figures import HEIGHTS, fit_overview
-from ..pages import SUMMARY, Judged, Plot, Section, Table, Texts
+from ..pages import SUMMARY, Judged, Plot, Section, Table, Texts, compare_columns
 from ..same_loops import find_same
 from ..stability import free_motions
 from ..variant import Cut, Implementation, Variant
@@ -279,17 +279,17 @@ def _loops(case: Case, numbers: Mapping[str, Number]) -> Table | None:
     actual = case.actual
     if actual is None:
         return None
-    found: dict[str, list[Number | None]] = {}
+    found: dict[str, dict[str, Number]] = {}
     for key, wire in case.loop_wires().items():
         starts = (f"inner.{key}.{actual.key}.{cut}" for cut in ("", "periodic."))
         start = next((s for s in starts if f"{s}stable" in numbers or f"{s}disk_margin" in numbers), None)
         if start is not None:
-            found[wire] = [numbers.get(f"{start}{name}") for name in LOOP_NUMBERS]
+            found[wire] = {name: numbers[f"{start}{name}"] for name in LOOP_NUMBERS if f"{start}{name}" in numbers}
     if not found:
         return None
-    all_rows = ((ROWS[name], *(values[i] for values in found.values())) for i, name in enumerate(LOOP_NUMBERS))
-    rows = tuple(row for row in all_rows if any(number is not None for number in row[1:]))
-    return Table(TEXTS.line("loops"), ("", *found), rows, TEXTS.line("confirmed"), digits=DIGITS, brief=True)
+    names = {name: ROWS[name] for name in LOOP_NUMBERS if any(name in values for values in found.values())}
+    note = TEXTS.line("confirmed")
+    return compare_columns(TEXTS.line("loops"), names, found.items(), note, digits=DIGITS, brief=True)
 
 
 def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:

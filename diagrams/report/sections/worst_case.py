@@ -130,9 +130,7 @@ class MissingWorstCase:
             for quantity, limit in limits.items():
                 if limit is not None:
                     place, why = ", ".join(loop), self.problem
-                    yield RequirementResult(
-                        quantity, place, KEY, limit, Verdict.UNDECIDED, Reason.NOT_ANALYSED, detail=why
-                    )
+                    yield RequirementResult(quantity, place, KEY, limit).undecided(Reason.NOT_ANALYSED, why)
 
     def section(self) -> Section:
         """Return the section, which has the reason alone."""
@@ -161,32 +159,30 @@ class ReportedWorstCase:
 
     def _result(self, loop: tuple[str, ...], quantity: str, limit: Limit) -> RequirementResult:
         found = self.found
-        result = RequirementResult(quantity, ", ".join(loop), KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+        result = RequirementResult(quantity, ", ".join(loop), KEY, limit)
         if found.unstable:
-            return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE)
+            return result.failed(Reason.UNSTABLE)
         mine = [case for case in found.cases if quantity in case.numbers.get(loop, {})]
         numbers = [(case, case.numbers[loop][quantity]) for case in mine]
         known = [(case, n) for case, n in numbers if not math.isnan(n.value)]
         if not known:
             return result
         case, number = min(known, key=lambda pair: limit.distance(pair[1].value))
-        verdict, reason, distance = judge(number, limit)
-        path = f"{KEY}.worst.{quantity}" if case is found.worst and quantity == case.quantity else ""
-        result = replace(result, verdict=verdict, reason=reason, distance=distance, number=number, path=path)
-        if found.failures and verdict is not Verdict.FAILED:
-            detail = found.failures[0].reason.rstrip(".")
-            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_ANALYSED, detail=detail)
-        if verdict is Verdict.PASSED and len(known) < len(numbers):  # some case has no such number
-            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NO_VALUE)
-        if verdict is Verdict.PASSED and any(one.state is CaseState.MOVING for one in found.cases):
-            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.MOVING)
-        if case is found.worst and loop == case.loop:
+        is_worst = case is found.worst
+        result = result.judged(number, f"{KEY}.worst.{quantity}" if is_worst and quantity == case.quantity else "")
+        if found.failures and result.verdict is not Verdict.FAILED:
+            return result.undecided(Reason.NOT_ANALYSED, found.failures[0].reason.rstrip("."))
+        if result.verdict is Verdict.PASSED and len(known) < len(numbers):  # some case has no such number
+            return result.undecided(Reason.NO_VALUE)
+        if result.verdict is Verdict.PASSED and any(one.state is CaseState.MOVING for one in found.cases):
+            return result.undecided(Reason.MOVING)
+        if is_worst and loop == case.loop:
             there = {at: numbers.get(quantity) for at, numbers in found.elsewhere.items()}
-            if any(n is None or judge(n, limit)[0] is not verdict for n in there.values()):
+            if any(n is None or judge(n, limit)[0] is not result.verdict for n in there.values()):
                 said = [f"{n.value:.4g} at {at}" for at, n in {"this cut": number, **there}.items() if n is not None]
-                return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.SEVERAL_CUTS, detail=", ".join(said))
-        if case is found.worst and self.run is not None and not self.run.agrees:
-            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.REFUTED)
+                return result.undecided(Reason.SEVERAL_CUTS, ", ".join(said))
+        if is_worst and self.run is not None and not self.run.agrees:
+            return result.undecided(Reason.REFUTED)
         return result
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq, minimize_scalar
 
-from loopwright.blocks import PID, Constant, Encoder, Integrator, UnknownNameError
+from loopwright.blocks import PID, Constant, Encoder, Integrator, Quantizer, UnknownNameError
 from loopwright.diagrams import Diagram, analyse, subsystem
 from loopwright.diagrams.paper.fig3_report import FIG3
 from loopwright.diagrams.report.pages.definitions import definition
@@ -86,6 +86,23 @@ def test_the_tables_have_the_tolerances_of_the_numbers():
     part = moving_report().sections[2].sections[0]
     cells = {id(cell) for table in part.tables for row in table.rows for cell in row}
     assert id(part.numbers["sampled_d0.phase_margin_deg"]) in cells
+
+
+@pytest.mark.slow
+def test_the_tables_have_them_where_the_numbers_carry_a_finding_as_well():
+    motor = Fmu(dc_motor.build(), name="motor")
+
+    @subsystem(sample_time=T)
+    def control(reference, measured):
+        seen = Quantizer(quantum=1e-3, name="encoder")(measured)
+        return PID(kp=KP, ki=KI, name="pi")(reference, seen).named("u")
+
+    made = Diagram("pi", motor(voltage=control(Constant(value=100.0), motor.speed), load_torque=0.0))
+    part = analyse(made, only=("inner",)).sections[-1].sections[0]
+    number = part.numbers["sampled_d0.phase_margin_deg"]
+    assert number.findings
+    assert "FMUs' linear models are right to" in number.confirmed_by
+    assert id(number) in {id(cell) for table in part.tables for row in table.rows for cell in row}
 
 
 def test_an_fmu_that_moves_is_no_equilibrium():
