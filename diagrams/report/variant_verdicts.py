@@ -25,7 +25,8 @@ from ..studies import is_zero, words_of
 from ..wiring import join
 from .case import Case
 from .sections.injection import REFUTED
-from .sections.step_responses import APART, key_of_step, unit_at
+from .sections.step_responses import unit_at
+from .sections.step_runs import APART, key_of_step
 from .stability import Stability, why_unstable
 from .variant import Cut, Variant
 

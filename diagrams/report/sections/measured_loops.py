@@ -24,7 +24,7 @@ from ...linearization import find_signal
 from .. import figures
 from ..case import Case
 from ..error_sentences import say
-from ..pages import Plot, Section, Table, Texts
+from ..pages import Plot, Section, TableForm, Texts
 from ..points import STEP
 from ..variant import Variant
 from .loops import ROWS
@@ -34,6 +34,17 @@ MEASURED = "measured"
 """Key of what was measured, in place of a variant's, in requirements and their verdicts."""
 QUANTITIES = ("phase_margin_deg", "gain_margin_low", "gain_margin_high", "delay_margin_s", "modulus_margin", "ms")
 """Margins that are next to the model's, by their names in dotted paths."""
+MARGINS = TableForm(
+    "Measured loops, and the model",
+    {
+        "wire": "wire",
+        "margin": "margin",
+        "measured": "measured",
+        "interval": "interval",
+        "model, {model}": "model",
+        "model in the interval": "inside",
+    },
+)
 SOURCE = "the data's uncertainty, and the distance of their points"
 
 
@@ -100,7 +111,7 @@ def measured_loops(case: Case, loops: Sequence[MeasuredLoop]) -> Section:
     if variant is None:
         raise OptionError("found no variant that can be analysed; expected one. Mend the diagram.", port="measured")
     numbers: dict[str, Number] = {}
-    rows: list[tuple[Any, ...]] = []
+    rows: list[dict[str, Any]] = []
     text, plots = [*TEXTS.paragraphs("data")], []
     for of in loops:
         text += [TEXTS.line("note", wire=of.wire, note=note) for note in of.margins.notes]
@@ -115,7 +126,8 @@ def measured_loops(case: Case, loops: Sequence[MeasuredLoop]) -> Section:
             model = None if exact is None else getattr(exact, name)
             inside = "" if model is None else "yes" if float(model) in interval else "no"
             span = f"{interval.low:.4g} … {interval.high:.4g}"
-            rows.append((of.wire, ROWS[name], number, span, "" if model is None else model, inside))
+            found = {"measured": number, "interval": span, "model": "" if model is None else model, "inside": inside}
+            rows.append({"wire": of.wire, "margin": ROWS[name], **found})
         plots.append(_plot(case, of, L, variant.title))
         if L is not None:
             values = np.ravel(of.data.frdata)
@@ -124,9 +136,8 @@ def measured_loops(case: Case, loops: Sequence[MeasuredLoop]) -> Section:
             worst = int(np.argmax(far))
             omega = float(of.data.omega[worst])
             text.append(TEXTS.line("deviation", wire=of.wire, deviation=far[worst], omega=omega))
-    columns = ("wire", "margin", "measured", "interval", f"model, {variant.title}", "model in the interval")
-    table = Table("Measured loops, and the model", columns, tuple(rows))
-    return Section("measured", "Measured loops", tuple(text), (table,) if rows else (), tuple(plots), numbers)
+    tables = (MARGINS.fill(rows, model=variant.title),) if rows else ()
+    return Section("measured", "Measured loops", tuple(text), tables, tuple(plots), numbers)
 
 
 def _numbers(key: str, name: str, interval: Interval) -> dict[str, Number]:

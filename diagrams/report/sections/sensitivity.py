@@ -11,7 +11,7 @@ from ...studies import Sensitivities, Sensitivity, confirm_parameter, sensitivit
 from .. import figures
 from ..case import Case
 from ..error_sentences import say
-from ..pages import Section, Table, Texts
+from ..pages import Section, TableForm, Texts
 from ..same_loops import find_same, is_same
 from .loops import ROWS
 
@@ -60,8 +60,7 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
     largest = [row for row in found.of(first) if _acts(row)]
     names = [row.parameter for row in largest[:SHOWN]]
     others = [row.parameter for row in largest[SHOWN:]]
-    rows: list[tuple[object, ...]] = []
-    numbers: dict[str, Number] = {}
+    rows: list[dict[str, object]] = []
     bars: dict[str, float] = {}
     kinks: list[str] = []
     lost: list[str] = []
@@ -81,12 +80,11 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
             made = [replace(row, slope=replace(row.slope, confirmed_by="")) for row in rough]
         bars[name] = next(row for row in made if row.quantity == first).per_percent.value
         for row in made:
-            numbers[f"{_path(name)}.{row.quantity}_per_percent"] = row.per_percent
             kinks += [name] if row.kink else []
             lost += [name] if row.rest_lost else []
-        cells = [row.per_percent for row in made]
         value = found[name, first]
-        rows.append((name, Number(value.value, value.unit or "1", 0.0, "", given=True), *cells))
+        facts = {"value": Number(value.value, value.unit or "1", 0.0, "", given=True), "key": _path(name)}
+        rows.append({"parameter": name, **facts, **{row.quantity: row.per_percent for row in made}})
     if kinks:
         text.append(TEXTS.line("kink", names=", ".join(dict.fromkeys(kinks))))
     if lost:
@@ -97,12 +95,15 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
     none = sorted({*found.without_effect, *small})
     if none:
         text.append(TEXTS.line("without", count=len(none), number=ROWS[first]))
-    columns = ("parameter", "value", *(f"{ROWS[quantity]} per +1 %" for quantity in shown))
-    table = Table(
-        f"Largest sensitivities at {wire}", columns, tuple(rows), digits=4, terms={"value": "parameter_value"}
+    form = TableForm(
+        "Largest sensitivities at {wire}",
+        {"parameter": "parameter", "value": "value", **{f"{ROWS[quantity]} per +1 %": quantity for quantity in shown}},
+        {quantity: f"{{key}}.{quantity}_per_percent" for quantity in shown},
+        digits=4,
+        terms={"value": "parameter_value"},
     )
     plot = figures.sensitivity_bars(f"sensitivity_{key}", wire, ROWS[first], bars)
-    return Section(key, f"Sensitivity of {wire}", tuple(text), (table,), (plot,), numbers)
+    return Section(key, f"Sensitivity of {wire}", tuple(text), (form.fill(rows, wire=wire),), (plot,))
 
 
 def _take_confirmed(rows: list[Sensitivity], confirmed: list[Sensitivity]) -> list[Sensitivity]:

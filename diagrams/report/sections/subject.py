@@ -44,6 +44,35 @@ OPERATING_POINTS = TableForm(
     {"t": "{key}.t", "residual": "{key}.residual", "affine": "{key}.affine"},
 )
 
+VARIANTS = TableForm("Variants that were analysed", {"variant": "title", "in paths": "key", "linear model": "model"})
+SUBSYSTEMS = TableForm(
+    "Subsystems and their rates",
+    {
+        "subsystem": "name",
+        "sample time": "rate",
+        "discretization": "method",
+        "delay [samples]": "delay",
+        "offset": "offset",
+    },
+)
+FMUS = TableForm(
+    "FMUs",
+    {
+        "block": "block",
+        "model": "model",
+        "version": "version",
+        "made by": "tool",
+        "FMI": "fmi",
+        "gives": "given",
+        "SHA-256": "digest",
+    },
+)
+PARAMETERS = TableForm(
+    "Parameters", {"block": "block", "type": "type", "parameter": "name", "value": "value", "unit": "unit"}
+)
+VERSIONS = TableForm("Versions", {"package": "package", "version": "version"}, details=True)
+NAMED_WIRES = TableForm("Named wires there ({variant})", {"wire": "wire", "value": "value"}, details=True)
+
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the libraries that computed the report."""
@@ -69,42 +98,31 @@ def subject(case: Case) -> Section:
         if rate is not None and subsystem.sample_time is not None:
             numbers[f"{path or 'diagram'}.sample_time"] = Number(float(rate), "s", 0.0, "given, exact", given=True)
         rated = "continuous" if rate is None else f"{float(rate):g} s"
-        subsystems.append(
-            (
-                name,
-                rated,
-                subsystem.method if rate is not None else "",
-                subsystem.delay if rate is not None else "–",
-                f"{float(subsystem.offset):g} s" if rate is not None else "–",
-            )
-        )
+        sampled = {
+            "method": subsystem.method,
+            "delay": subsystem.delay,
+            "offset": f"{float(subsystem.offset):g} s",
+        }
+        held = {"method": "", "delay": "–", "offset": "–"} if rate is None else sampled
+        subsystems.append({"name": name, "rate": rated, **held})
     for path, block in sorted(diagram.blocks.items()):
         rows = list(_fmu_parameters(block) if isinstance(block, Fmu) else _parameters(block))
         for name, shown, unit, value in rows:
             # Parameters without effect are listed in one line below the table; their numbers stay in the JSON.
             if name not in block.idle_parameters:
-                parameters.append((path, type(block).__name__, name, shown, print_unit(unit)))
+                facts = {"block": path, "type": type(block).__name__, "name": name}
+                parameters.append({**facts, "value": shown, "unit": print_unit(unit)})
             if isinstance(value, float) and np.isfinite(value):
                 numbers[f"{path}.{name}"] = Number(value, unit or "1", 0.0, "given", given=True)
         if isinstance(block, Fmu):
             plants.append(_plant(path, block))
-    tables = [
-        Table(
-            "Subsystems and their rates",
-            ("subsystem", "sample time", "discretization", "delay [samples]", "offset"),
-            tuple(subsystems),
-        ),
-    ]
-    if plants:
-        columns = ("block", "model", "version", "made by", "FMI", "gives", "SHA-256")
-        tables.append(Table("FMUs", columns, tuple(plants)))
-    tables.insert(0, _variants(case))
-    listed = Table("Parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters))
+    tables = [_variants(case), SUBSYSTEMS.fill(subsystems), *([FMUS.fill(plants)] if plants else [])]
     found = [(path, block, name) for path, block in sorted(diagram.blocks.items()) for name in block.idle_parameters]
     idle = sorted(f"{path}.{name}" for path, block, name in found if getattr(block, name) is not None)
     said = (TEXTS.line("idle", names=idle),) if idle else ()
-    parts = (Section("parameters", "Parameters", said, tables=(listed,)),) if parameters else ()
-    tables.append(Table("Versions", ("package", "version"), tuple(versions().items()), details=True))
+    listed = (PARAMETERS.fill(parameters),)
+    parts = (Section("parameters", "Parameters", said, tables=listed),) if parameters else ()
+    tables.append(VERSIONS.fill({"package": name, "version": number} for name, number in versions().items()))
     text = [TEXTS.line("diagram", name=diagram.name, blocks=len(diagram.blocks), wires=len(diagram.names))]
     if case.experiment is not None:
         name = case.experiment.diagram.name.replace("_", " ")
@@ -147,8 +165,9 @@ def _variants(case: Case) -> Table:
     rows = []
     for v in case.variants.values():
         rate = "sampled" if not v.problem and v.model.dt else "–" if v.problem else "continuous"
-        rows.append((v.title, v.key, "left out" if v.problem else f"{rate}, order {len(v.model.states)}"))
-    return Table("Variants that were analysed", ("variant", "in paths", "linear model"), tuple(rows))
+        model = "left out" if v.problem else f"{rate}, order {len(v.model.states)}"
+        rows.append({"title": v.title, "key": v.key, "model": model})
+    return VARIANTS.fill(rows)
 
 
 def _shown(value: Any) -> str:
@@ -168,7 +187,8 @@ def _shown(value: Any) -> str:
     return str(value)
 
 
-def _plant(path: str, block: Fmu) -> tuple[Any, ...]:
+def _plant(path: str, block: Fmu) -> dict[str, Any]:
+    """Return the facts of `FMUS` of a block."""
     d = block.description
     given = [
         name
@@ -179,8 +199,8 @@ def _plant(path: str, block: Fmu) -> tuple[Any, ...]:
         )
         if has
     ]
-    tool = d.generation_tool or "–"
-    return (path, d.model_name, d.model_version or "–", tool, d.fmi, ", ".join(given) or "–", d.digest)
+    facts = {"block": path, "model": d.model_name, "version": d.model_version or "–", "tool": d.generation_tool or "–"}
+    return {**facts, "fmi": d.fmi, "given": ", ".join(given) or "–", "digest": d.digest}
 
 
 def operating_points(case: Case) -> Section:
@@ -211,13 +231,12 @@ def operating_points(case: Case) -> Section:
     tables = [OPERATING_POINTS.fill(rows)]
     first = next(case.usable(), None)
     if first is not None:
-        values = [
-            (name, _shown(_rounded(_value(first, wire))))
+        values = (
+            {"wire": name, "value": _shown(_rounded(_value(first, wire)))}
             for name, wire in sorted(first.diagram.names.items())
             if f"{wire.block}.{wire.port}" in first.point.values
-        ]
-        named = f"Named wires there ({first.title})"
-        tables.append(Table(named, ("wire", "value"), tuple(values), details=True))
+        )
+        tables.append(NAMED_WIRES.fill(values, variant=first.title))
     text = (*TEXTS.paragraphs("operating_points"), *notes)
     return Section("operating_points", "Operating points", text, tuple(tables))
 

@@ -36,7 +36,8 @@ from .contacts import KEY as CONTACT
 from .loops import ROWS
 from .measured_loops import MEASURED
 from .poles import unstable_first
-from .step_responses import APART, NAMES, step_tests
+from .step_responses import NAMES
+from .step_runs import APART, step_tests
 from .worst_case import KEY as WORST_CASE
 from .worst_case import MissingWorstCase, ReportedWorstCase
 

@@ -27,13 +27,20 @@ from ...studies import (
 )
 from ..content_hash import content_hash
 from ..error_sentences import say
-from ..pages import Plot, Section, Table, Texts
+from ..pages import Plot, Section, Table, TableForm, Texts
 from .loops import ROWS
 
 TEXTS = Texts(__package__, "worst_case")
 KEY = "worst_case"
-GROWING, GROWTH = "worst_growth", "growth of the fastest pole"
 """Key of the section, and the variant that its verdicts belong to."""
+GROWING, GROWTH = "worst_growth", "growth of the fastest pole"
+"""End of the path of an unstable case's number, and its name in words."""
+
+NEXT_TO_NOMINAL = TableForm(
+    "Worst case, next to the diagram as it is", {"case": "case", "number": "words", "value": "number"}, digits=4
+)
+PARAMETERS = TableForm("Parameters of the worst case", {"parameter": "name", "value": "value"})
+RANGES = TableForm("Ranges of the parameters", {"parameter": "name", "from": "low", "to": "high", "values": "kind"})
 
 
 def read_task(
@@ -192,17 +199,18 @@ def _text(value: object) -> str:
 
 def _ranges(found: WorstCase) -> Table:
     """Return the table of the ranges that were searched, or of the samples that were given in their place."""
-    rows: list[tuple[str, str, str, str]] = []
+    rows: list[dict[str, str]] = []
     for name in dict.fromkeys(name for case in found.cases for name in case.parameters):
         box = found.boxes.get(name)
         if box is not None:
-            rows.append((name, _text(box.low), _text(box.high), f"range, {box.scale}"))
+            ends = {"low": _text(box.low), "high": _text(box.high)}
+            rows.append({"name": name, **ends, "kind": f"range, {box.scale}"})
             continue
         values = [case.parameters[name] for case in found.cases if name in case.parameters]
         plain = all(isinstance(value, float | int) and not isinstance(value, bool) for value in values)
         low, high = (_text(min(values)), _text(max(values))) if plain else ("–", "–")
-        rows.append((name, low, high, "given samples"))
-    return Table("Ranges of the parameters", ("parameter", "from", "to", "values"), tuple(rows))
+        rows.append({"name": name, "low": low, "high": high, "kind": "given samples"})
+    return RANGES.fill(rows)
 
 
 def worst_case_of(reported: ReportedWorstCase | MissingWorstCase) -> Section:
@@ -232,13 +240,12 @@ def worst_case_of(reported: ReportedWorstCase | MissingWorstCase) -> Section:
             how = f"{number.confirmed_by}; {confirmed}" if confirmed and case is worst else number.confirmed_by
             numbers[f"{name}.{case.quantity}"] = replace(number, confirmed_by=how)
     rows = [
-        (case.replace("_", " "), ROWS.get(name, GROWTH if name == GROWING else name), number)
+        {"case": case.replace("_", " "), "words": ROWS.get(name, GROWTH if name == GROWING else name), "number": number}
         for (case, _, name), number in ((path.partition("."), number) for path, number in numbers.items())
     ]
-    tables = [Table("Worst case, next to the diagram as it is", ("case", "number", "value"), tuple(rows), digits=4)]
-    given = tuple((name, _text(value)) for name, value in worst.parameters.items())
-    if given:
-        tables.append(Table("Parameters of the worst case", ("parameter", "value"), given))
+    tables = [NEXT_TO_NOMINAL.fill(rows)]
+    if worst.parameters:
+        tables.append(PARAMETERS.fill({"name": name, "value": _text(v)} for name, v in worst.parameters.items()))
     tables.append(_ranges(found))
     plots = []
     if any(np.ndim(value) == 0 for value in worst.parameters.values()):

@@ -23,7 +23,7 @@ def test_an_error_is_what_was_found_and_a_next_step():
     [
         (
             step_responses,
-            "_run",
+            "run_step",
             "steps",
             RUN,
             "at control.u: not tried. Found inf (plant.y, t = 1.25 s). To change it: Look",

@@ -7,7 +7,8 @@ from scipy.optimize import brentq
 from loopwright.blocks import Constant, Integrator, Sum, TransferFunction
 from loopwright.diagrams import Diagram, Requirements, analyse
 from loopwright.diagrams.measure import StepResponse
-from loopwright.diagrams.report.sections.step_responses import _deviation, _how
+from loopwright.diagrams.report.sections.step_responses import _how
+from loopwright.diagrams.report.sections.step_runs import deviation as deviation_of
 from loopwright.types import Verdict
 
 
@@ -44,7 +45,7 @@ def response(outputs, y, linear, before=None, wire_before=0.0):
 )
 def test_the_deviation_is_relative_to_the_signals_own_largest_change(outputs, y, linear, before, deviation):
     got = response(outputs, y, linear, before)
-    assert _deviation(got) == pytest.approx(deviation, rel=1e-9, abs=1e-12)
+    assert deviation_of(got) == pytest.approx(deviation, rel=1e-9, abs=1e-12)
     assert ("does not agree" in _how(got).method) == (deviation > 0.01)
     assert f"differs by {deviation:.2g} of" in _how(got)
 
