@@ -56,15 +56,6 @@ ANY_DIAGRAM = ReportKind(
 """The report of a diagram of which nothing is known but its structure."""
 
 
-def check_workers(given: int | None, written: bool) -> int:
-    """Return the number of processes that make the sections of a report."""
-    if given is None:
-        return min(processors(), 2) if written else 1
-    if isinstance(given, bool) or not isinstance(given, int) or given < 1:
-        raise OptionError(f"found {given!r}; expected 1, or 2 for a second process. Give one of them.", port="workers")
-    return given
-
-
 def _is_diagram(value: Any) -> bool:
     return isinstance(getattr(value, "wired", None), WiredDiagram)
 
@@ -99,6 +90,7 @@ def _with_notes(function: F) -> F:
     appendix=kinds.flag,
     measured=kinds.mapping,
     contacts=kinds.either(kinds.mapping, kinds.one_of_class(ContactTask, "a ContactTask"), kinds.path),
+    workers=kinds.integer(1).worded("1, or 2 for a second process", "Give one of them."),
 )
 @on_one_thread
 @offer_elsewhere(**{name: f"about={{'{name}': …}}" for name in _HEADING})
@@ -218,7 +210,9 @@ def analyse(
         asked = Requirements(stable=False)  # a robot that yields to a force may drift, and has a pole on the limit
     task = read_task(wired, worst_case, file, asked)
     axes, names = AxisUnits(decibels, hertz), tuple(measured or ())
-    how: dict[str, Any] = {"workers": check_workers(workers, _written), "drawn": _written and not summary}
+    if workers is None:  # a second process is worth its start where figures are drawn, too
+        workers = min(processors(), 2) if _written else 1
+    how: dict[str, Any] = {"workers": workers, "drawn": _written and not summary}
     case, sections = kind.sections(wired, point, experiment, wires, only, notify, stairs, asked, axes, names, **how)
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:

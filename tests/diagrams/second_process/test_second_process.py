@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.blocks import LoopwrightError, OptionError
-from loopwright.diagrams.report.analysis import check_workers
+from loopwright.blocks import Constant, LoopwrightError, OptionError
+from loopwright.diagrams import Diagram, analyse
 from loopwright.diagrams.second_process import SecondProcess
 from support.marked import ON_LINUX, Host
 from support.waiting import wait_for
@@ -88,11 +88,9 @@ def test_a_task_that_can_not_be_sent_is_done_here():
 
 
 def test_the_number_of_processes_is_checked():
-    assert check_workers(1, written=True) == 1
-    assert check_workers(None, written=False) == 1
     for wrong in (0, True, 1.5):
         with pytest.raises(OptionError, match="expected 1, or 2"):
-            check_workers(wrong, written=True)
+            analyse(Diagram("held", Constant(value=1.0)), workers=wrong)
 
 
 @pytest.mark.slow
@@ -126,6 +124,7 @@ HOST = f"""
 import sys, time
 from pathlib import Path
 sys.path[:0] = {[os.path.dirname(__file__), str(Path(__file__).parents[2])]!r}
+from loopwright.diagrams import Diagram, analyse
 from loopwright.diagrams.second_process import SecondProcess
 from test_second_process import Holds
 with SecondProcess(Holds(Path(sys.argv[1])).make, "letters") as second:
