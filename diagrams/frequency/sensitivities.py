@@ -75,29 +75,21 @@ def gang_of_four(plant: LinearSystem, controller: LinearSystem) -> GangOfFour:
     """
     import control
 
-    first, second = control.ss(plant), control.ss(controller)
-    S = sensitivity(first * second)
-    P, C, dt = read_matrices(first), read_matrices(second), read_matrices(S).dt
-    x, n, m = np.eye(P.outputs), P.states + C.states, P.outputs
-    # y = P (d − C w), w = y + r: from r and d to y and C w, once, on the joint states
-    zero = np.zeros((C.states, P.states))
-    inverse = invert_loop(x + P.D @ C.D)
-    Cy = inverse @ np.hstack([P.C, -P.D @ C.C])
-    Dy = inverse @ np.hstack([-P.D @ C.D, P.D])
-    select = np.hstack([np.eye(m), np.zeros((m, P.inputs))])
-    Cw, Dw = Cy, Dy + select
-    Cu = np.hstack([np.zeros((C.outputs, P.states)), C.C]) + C.D @ Cw
-    Du = C.D @ Dw
-    load = np.hstack([np.zeros((P.inputs, m)), np.eye(P.inputs)])
-    A = np.block([[P.A, np.zeros((P.states, C.states))], [zero, C.A]])
-    A = A + np.vstack([-P.B @ Cu, C.B @ Cw]) if n else A
-    B = np.vstack([P.B @ (load - Du), C.B @ Dw])
-    return GangOfFour(
-        S=S,
-        PS=make_state_space(A, B[:, m:], Cy, Dy[:, m:], dt),
-        CS=make_state_space(A, B[:, :m], Cu, Du[:, :m], dt),
-        T=make_state_space(A, B[:, :m], -Cy, -Dy[:, :m], dt),
-    )
+    P, C = control.ss(plant), control.ss(controller)
+    S = sensitivity(P * C)
+    # both side by side, with u = d − C w and w = r + y around them: from (d, r) to (y, C w), on the joint states
+    inputs, outputs = P.ninputs, P.noutputs
+    around = np.block([[np.zeros((inputs, outputs)), -np.eye(inputs)], [np.eye(outputs), np.zeros((outputs, inputs))]])
+    closed = read_matrices(control.feedback(control.append(P, C), around, sign=1))
+    d, r = slice(None, inputs), slice(inputs, None)
+    y, u = slice(None, outputs), slice(outputs, None)
+
+    def part(out: slice, into: slice, sign: float = 1.0) -> StateSpace:
+        return make_state_space(
+            closed.A, closed.B[:, into], sign * closed.C[out], sign * closed.D[out, into], closed.dt
+        )
+
+    return GangOfFour(S=S, PS=part(y, d), CS=part(u, r), T=part(y, r, -1.0))
 
 
 def invert_loop(M: np.ndarray) -> np.ndarray:
