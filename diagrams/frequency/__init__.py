@@ -8,7 +8,8 @@ from .delay_matrices import NEUTRAL, DelayMatrices, find_pade_limit, replace_del
 from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
-from .loop_drawing import DrawnLoop, draw_bode_axes, draw_nyquist_axes, phase_of
+from .drawn_loops import DrawnLoop, phase_of
+from .loop_drawing import draw_bode_axes, draw_nyquist_axes
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins, scan_margins
 from .loop_model import find_hidden_unstable
 from .margin_analysis import MARGIN_UNITS

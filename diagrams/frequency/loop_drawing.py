@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...blocks.core import decibels, with_unit
 from ..plotting import DARK, GREY, STONE, AxisUnits, set_degrees, set_frequencies, set_magnitudes
+from .drawn_loops import DrawnLoop, phase_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,58 +18,6 @@ if TYPE_CHECKING:
 
 OFF_THE_PAGE = 1e3
 """Size of L from which on it is not drawn in the complex plane: beyond lies the other branch of a resonance."""
-
-
-@dataclass(frozen=True)
-class DrawnLoop:
-    """A loop to draw, L at rising frequencies, with the margins that are marked."""
-
-    title: str
-    omega: np.ndarray  # in rad/s
-    values: np.ndarray
-    look: Mapping[str, Any]
-    margins: Margins | None = None  # None where they are not known
-    dt: float = 0.0  # 0 of a continuous loop
-    is_measured: bool = False  # whether the values are points of data
-
-    @property
-    def color(self) -> Any:
-        """Color of the curve and of its marks."""
-        return self.look["color"]
-
-    def shows(self, omega: float) -> bool:
-        """Whether a frequency is among those that are drawn."""
-        return len(self.omega) > 0 and bool(self.omega[0] <= omega <= self.omega[-1])
-
-    def gain_crossovers(self) -> list[tuple[float, float]]:
-        """Return the frequencies in view at which |L| = 1, in rad/s, with the phase margins there in degrees."""
-        found = () if self.margins is None else self.margins.gain_crossovers
-        pairs = [(c.frequency.value, c.phase_margin_deg.value) for c in found]
-        return [pair for pair in pairs if self.shows(pair[0])]
-
-    def phase_crossovers(self) -> list[tuple[float, float]]:
-        """Return the frequencies in view at which L is real and negative, in rad/s, with the gain margins there."""
-        found = () if self.margins is None else self.margins.phase_crossovers
-        pairs = [(c.frequency.value, c.gain_margin.value) for c in found]
-        return [pair for pair in pairs if self.shows(pair[0]) and 0.0 < pair[1] < np.inf]
-
-
-def phase_of(loop: DrawnLoop) -> np.ndarray:
-    """Return the phase of a loop in degrees without jumps, on the branch on which its phase margin can be read.
-
-    It is −180° plus the phase margin at the gain crossover with the smallest one. Without such a crossover it is −180°
-    at the phase crossover whose gain margin is nearest to 1. Without both, it is in (−270°, 90°] at the lowest
-    frequency.
-    """
-    phase = np.degrees(np.unwrap(np.angle(loop.values)))
-    if crossings := loop.gain_crossovers():
-        omega, margin = min(crossings, key=lambda pair: abs(pair[1]))
-        wanted = margin - 180.0
-    elif crossings := loop.phase_crossovers():
-        omega, wanted = min(crossings, key=lambda pair: abs(np.log(pair[1])))[0], -180.0
-    else:
-        return np.asarray(phase - 360.0 * np.ceil((phase[:1] - 90.0) / 360.0))
-    return np.asarray(phase + 360.0 * np.round((wanted - np.interp(omega, loop.omega, phase)) / 360.0))
 
 
 def _reference(loop: DrawnLoop, phase: np.ndarray, omega: float, margin: float = 0.0) -> float:

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from ...blocks.core import (
     Grid,
-    LoopwrightError,
     OptionError,
     Sheet,
     accepts,
@@ -20,14 +19,27 @@ from ...blocks.core import (
     explain_calls,
     kinds,
     missing_member,
-    shorten,
     with_unit,
 )
-from ..plotting import COLORS, GREY, LINES, AxisUnits, legend_above, mark_zeros, shown_figure
+from ..plotting import GREY, AxisUnits, legend_above, mark_zeros, shown_figure
 from .delayed_realization import DelayedRealization, realize
 from .delayed_system import DelayedSystem
-from .loop_drawing import DrawnLoop, describe_margins, draw_bode_axes, draw_nichols_axes, draw_nyquist_axes
-from .loop_margins import Margins, margins
+from .drawn_loops import (
+    BELOW,
+    POINTS,
+    DrawnLoop,
+    confirmed_margins,
+    drawn_loops,
+    find_spans,
+    frequencies_of,
+    is_measured,
+    limit_of,
+    name_loops,
+    read_omega,
+    response_of,
+    style_of,
+)
+from .loop_drawing import describe_margins, draw_bode_axes, draw_nichols_axes, draw_nyquist_axes
 from .pole_maps import plot_poles, plot_root_locus, refuse_delays
 from .poles_and_zeros import finite_zeros
 
@@ -36,11 +48,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-POINTS = 800
-BELOW = 1 - 1e-6
-"""Part of π/T up to which a sampled loop is drawn."""
-AROUND = 3.0
-"""Factor by which what is drawn goes beyond the crossovers at which margins are read."""
 FAR = 8.0
 """Largest part of the plane that a Nyquist plot shows: the real and imaginary part up to this."""
 
@@ -110,7 +117,7 @@ class LoopPlots:
     ) -> tuple[tuple[Any, ...], list[DrawnLoop]]:
         """Return this loop and the others, and all of them as they are drawn."""
         loops = (self, *others)
-        return loops, drawn_loops(loops, _name_loops(loops, labels), omega, marked=marked)
+        return loops, drawn_loops(loops, name_loops(loops, labels), omega, marked=marked)
 
     @accepts(omega=kinds.frequencies, labels=kinds.names, db=kinds.flag, hz=kinds.flag, margins=kinds.flag)
     def bode(
@@ -197,10 +204,10 @@ class LoopPlots:
         OptionError
             If the loop has several inputs or outputs, or delays.
         """
-        (name,) = _name_loops((self,), None)
+        (name,) = name_loops((self,), None)
         refuse_delays(self, name)
         chosen = None if gains is None else np.unique(np.asarray(gains, dtype=float))
-        return plot_root_locus(self, name, chosen, _margins(self) if margins else None)
+        return plot_root_locus(self, name, chosen, confirmed_margins(self) if margins else None)
 
     @accepts()
     def pzmap(self) -> Figure:
@@ -211,7 +218,7 @@ class LoopPlots:
         OptionError
             If the loop has several inputs or outputs, or delays.
         """
-        (name,) = _name_loops((self,), None)
+        (name,) = name_loops((self,), None)
         refuse_delays(self, name)
         loop: Any = self
         return plot_poles(np.ravel(loop.poles()), finite_zeros(loop), float(self.dt or 0.0), f"poles of {name}")
@@ -235,7 +242,7 @@ class LoopPlots:
             If a loop has several inputs or outputs or is measured data, or the closed loop is not stable.
         """
         loops = (self, *others)
-        names = _name_loops(loops, labels)
+        names = name_loops(loops, labels)
         closed = [_close_loop(loop) for loop in loops]
         return _plot_step(closed, names, t, max(map(_horizon, loops)))
 
@@ -263,7 +270,7 @@ class LoopPlots:
             If one of them was not made by `Linearization.loop` at one wire with one entry.
         """
         loops = (self, *others)
-        names = _name_loops(loops, labels)
+        names = name_loops(loops, labels)
         return _plot_gang_of_four([_find_gang_of_four(loop, measured) for loop in loops], names, omega)
 
 
@@ -351,7 +358,7 @@ def _find_gang_of_four(loop: Any, measured: str) -> dict[str, StateSpace]:
 def _close_loop(loop: Any) -> StateSpace:
     """Return T = L/(1 + L), which must be stable: the model's own, where a loop knows its model."""
     name = str(getattr(loop, "name", None) or "loop")
-    if _is_measured(loop):
+    if is_measured(loop):
         raise OptionError(
             "found frequency-response data; expected a linear system: data has no step response. Leave it out.",
             block=name,
@@ -377,175 +384,29 @@ def _close_loop(loop: Any) -> StateSpace:
 
 def _horizon(loop: Any) -> float:
     """Return the time in s over which a step response is shown: 30 divided by the lowest gain crossover."""
-    w = _frequencies(loop)
-    size = np.abs(_response(loop, w))
+    w = frequencies_of(loop)
+    size = np.abs(response_of(loop, w))
     crossed = w[1:][(size[1:] > 1.0) != (size[:-1] > 1.0)]
     return 30.0 / float(crossed[0] if crossed.size else np.sqrt(w[0] * w[-1]))
-
-
-def _is_measured(loop: Any) -> bool:
-    """Whether a loop is frequency-response data rather than a linear system."""
-    return hasattr(loop, "frdata") and hasattr(loop, "omega")
-
-
-def _name_loops(loops: Sequence[Any], labels: Sequence[str] | None) -> list[str]:
-    """Return a label for each loop with one input and one output: its name, numbered where it repeats."""
-    for loop in loops:
-        size = getattr(loop, "noutputs", None), getattr(loop, "ninputs", None)
-        if size != (1, 1):
-            found = f"{size[0]} outputs and {size[1]} inputs" if size[0] else f"{type(loop).__name__}"
-            raise OptionError(
-                f"found {found}; expected a loop with one input and one output, as linearize().loop('u') or a "
-                "python-control system. Plot an entry, L[0, 0], or look at mimo_disk_margin(L).",
-                block=str(getattr(loop, "name", None) or "loop"),
-            )
-    if labels is None:
-        names = [str(getattr(loop, "name", None) or "loop") for loop in loops]
-        return [f"{n} ({names[: i + 1].count(n)})" if names.count(n) > 1 else n for i, n in enumerate(names)]
-    if len(labels) != len(loops):
-        raise OptionError(
-            f"found {len(labels)} labels for {len(loops)} loops; expected one for each. Give as many.",
-            port="labels",
-        )
-    return [str(label) for label in labels]
-
-
-def _frequencies(loop: Any) -> np.ndarray:
-    """Return frequencies in rad/s over which a loop is worth looking at: around its crossovers, poles and zeros."""
-    if _is_measured(loop):
-        return np.asarray(loop.omega, dtype=float)
-    if isinstance(loop, DelayedSystem):
-        return _between_crossings(loop, DelayedRealization.of(loop).features.sizes(), 0.0)
-    dt = float(loop.dt or 0.0)
-    marks = np.abs(np.concatenate([np.ravel(loop.poles()), np.ravel(loop.zeros())]))
-    if dt:
-        roots = np.concatenate([np.ravel(loop.poles()), np.ravel(loop.zeros())]).astype(complex)
-        with np.errstate(all="ignore"):
-            marks = np.abs(np.log(roots[np.abs(roots) > 1e-6]) / dt)
-    return _between_crossings(loop, marks, dt)
-
-
-def _between_crossings(loop: Any, marks: np.ndarray, dt: float) -> np.ndarray:
-    """Return frequencies around the crossovers of a loop, whose poles and zeros have these sizes in rad/s."""
-    limit = np.pi / dt if dt else np.inf
-    marks = marks[np.isfinite(marks) & (marks > 1e-6) & (marks < limit)]
-    high = min(1e3 * float(np.max(marks, initial=1.0)), limit)
-    wide = np.geomspace(1e-3 * float(np.min(marks, initial=min(1.0, 0.1 * limit))), high, 2000)
-    size = np.abs(realize(loop).response(wide * (1 - 1e-9))[0])
-    crossed = wide[1:][(size[1:] > 1.0) != (size[:-1] > 1.0)]
-    if crossed.size:
-        low, high = float(crossed[0]) / 50, min(float(crossed[-1]) * 50, limit)
-    else:
-        low, high = wide[0] * 100, min(high / 30, limit)
-    return np.geomspace(min(low, high / 100), high * (1 - 1e-9 if dt else 1.0), POINTS)
-
-
-def _response(loop: Any, omega: np.ndarray) -> np.ndarray:
-    """Return the values of a loop at frequencies in rad/s; of data those that it has."""
-    if _is_measured(loop):
-        return np.asarray(np.reshape(loop.frdata, (1, 1, -1))[0, 0], dtype=complex)
-    return np.asarray(realize(loop).response(omega)[0])
-
-
-def _span(loops: Sequence[Any], found: Sequence[Margins | None], omega: ArrayLike | None) -> list[np.ndarray]:
-    """Return the frequencies of each loop: those that are asked for, below half its sampling frequency.
-
-    Without any, all loops are drawn over the same ones: around their crossovers, and up to half the sampling frequency
-    of the fastest loop. The crossovers at which their margins are read are well within.
-    """
-    own = [_frequencies(loop) for loop in loops]
-    read = [w for one in found if one is not None for w in one.deciding_frequencies()]
-    low = min([*(float(w[0]) for w in own), *(w / AROUND for w in read)])
-    high = max([*(float(w[-1]) for w in own), *(w * AROUND for w in read)])
-    ends = [end for end in map(_limit, loops) if np.isfinite(end)]
-    high = max([high, *ends]) if omega is None else high
-    spans = []
-    for loop, w in zip(loops, own, strict=True):
-        if _is_measured(loop):
-            spans.append(w)
-            continue
-        if omega is None:
-            spans.append(realize(loop).grid(low, min(high, BELOW * _limit(loop)), POINTS))
-            continue
-        asked = _read_omega(omega)
-        limit = _limit(loop)
-        shown = asked[asked < limit]
-        if not shown.size:
-            raise OptionError(
-                f"found {shorten(omega)} rad/s, none below π/T = {limit:.6g} rad/s of the loop sampled every "
-                f"{float(loop.dt):g} s; expected one at least. Give lower ones, or leave the loop out.",
-                port="omega",
-            )
-        spans.append(
-            np.append(shown, limit * BELOW) if shown.size < asked.size and shown[-1] < limit * BELOW else shown
-        )
-    return spans
-
-
-def _read_omega(omega: Any) -> np.ndarray:
-    """Return frequencies that were given, in ascending order, each once."""
-    return np.unique(np.asarray(omega, dtype=float))
-
-
-def _limit(loop: Any) -> float:
-    """Return half the sampling frequency of a loop in rad/s; infinite of a continuous one, and of data."""
-    dt = 0.0 if _is_measured(loop) else float(loop.dt or 0.0)
-    return float(np.pi) / dt if dt else np.inf
 
 
 def _write_ends(axes: Axes, loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> None:
     """Say in a figure which loops end at π/T although higher frequencies were asked for."""
     if omega is None:
         return
-    highest = _read_omega(omega)[-1]
+    highest = read_omega(omega)[-1]
     cut = [
-        f"{name} at π/T = {_limit(loop):.4g} rad/s"
+        f"{name} at π/T = {limit_of(loop):.4g} rad/s"
         for name, loop in zip(names, loops, strict=True)
-        if highest >= _limit(loop)
+        if highest >= limit_of(loop)
     ]
     if cut:
         axes.set_title("Ends: " + ", ".join(cut), loc="left", fontsize="small")
 
 
-def _style_of(i: int, loop: Any) -> dict[str, Any]:
-    color = COLORS[i % len(COLORS)]
-    if _is_measured(loop):
-        return {"color": color, "linestyle": "none", "marker": "o", "markersize": 3.5, "fillstyle": "none"}
-    return {"color": color, "linestyle": LINES[(i // len(COLORS) + i) % len(LINES)]}
-
-
 def _legend(figure: Figure, axes: Axes) -> None:
     legend_above(figure, axes)
     figure.align_ylabels()
-
-
-def drawn_loops(
-    loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None, *, marked: bool
-) -> list[DrawnLoop]:
-    """Return loops as they are drawn."""
-    found = [_margins(loop) if marked else None for loop in loops]
-    return [
-        DrawnLoop(
-            name,
-            w,
-            _response(loop, w),
-            _style_of(i, loop),
-            own,
-            0.0 if _is_measured(loop) else float(loop.dt or 0.0),
-            _is_measured(loop),
-        )
-        for i, (loop, name, own, w) in enumerate(zip(loops, names, found, _span(loops, found, omega), strict=True))
-    ]
-
-
-def _margins(loop: Any) -> Margins | None:
-    """Return the margins of a loop; None of data, and where they can't be confirmed."""
-    if _is_measured(loop):
-        return None
-    try:
-        return margins(loop)
-    except LoopwrightError:  # a figure is drawn all the same: margins(loop) says why
-        return None
 
 
 def _write_title(axes: Axes, drawn: Sequence[DrawnLoop], loops: Sequence[Any], omega: ArrayLike | None) -> None:
@@ -609,7 +470,7 @@ def _plot_step(closed: Sequence[Any], names: Sequence[str], times: ArrayLike | N
             answer = system.step_response(grid)[:, 0] if isinstance(system, DelayedSystem) else None
             if answer is None:
                 answer = np.ravel(control.step_response(system, T=grid).y)
-            look = _style_of(i, system)
+            look = style_of(i, system)
             axes.plot(grid, answer, label=names[i], drawstyle="steps-post" if dt else "default", **look)
         axes.axhline(1.0, color=GREY, linewidth=0.8, zorder=0)
         axes.set(xlim=(0.0, end), xlabel=with_unit("t", "s"), ylabel="response to a unit step")
@@ -623,12 +484,12 @@ def _plot_gang_of_four(systems: Sequence[Mapping[str, Any]], names: Sequence[str
         panels = figure.subplots(2, 2, sharex=True)
         for axes, key in zip(np.ravel(panels), ("S", "PS", "CS", "T"), strict=True):
             own = [found[key] for found in systems]
-            spans = _span([found["L"] for found in systems], (), omega)
+            spans = find_spans([found["L"] for found in systems], (), omega)
             for i, (system, w) in enumerate(zip(own, spans, strict=True)):
                 if omega is None:  # closed loops have other resonances, up to π/T
-                    top = _limit(system) * BELOW if system.dt else float(w[-1])
+                    top = limit_of(system) * BELOW if system.dt else float(w[-1])
                     w = realize(system).grid(float(w[0]), top, POINTS)
-                axes.plot(w, np.abs(_response(system, w)), label=names[i], **_style_of(i, system))
+                axes.plot(w, np.abs(response_of(system, w)), label=names[i], **style_of(i, system))
             mark_zeros(axes)
             axes.set_xscale("log")
             axes.set_yscale("log")

@@ -6,8 +6,7 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, OptionError, TransferFunction, TransportDelay
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.frequency.loop_drawing import phase_of
-from loopwright.diagrams.frequency.loop_transfer import drawn_loops
+from loopwright.diagrams.frequency.drawn_loops import drawn_loops, phase_of
 from loopwright.frequency import margins
 
 KP, KI, TAU = 5.0, 4.0, 0.05
