@@ -600,7 +600,8 @@ class Run(ShownAsTable):
     def to_csv(self, path: PathLike | IO[str], *names: str) -> None:
         """Write ``t`` (s) and signals as comma-separated values, 17 significant digits.
 
-        A column is named after its signal; those of a vector are ``name[1]``, ``name[2]``, ….
+        A column is named after its signal; those of a vector are ``name[1]``, ``name[2]``, …. The column of a wire
+        that is called ``t`` itself is ``s_t``.
 
         Parameters
         ----------

@@ -52,10 +52,10 @@ def to_xarray(
     """Return signals, with the unit of each entry, as a Dataset; see `Run.to_xarray`."""
     xarray = import_library("xarray")
     variables, coordinates = {}, {"t": ("t", np.array(t), {"units": "s"})}
-    for name, values in signals.items():
-        axes = values.shape[1:]
+    for recorded, values in signals.items():
+        name, axes = name_next_to_time(recorded), values.shape[1:]
         dims = [f"{name}_dim"] if len(axes) == 1 else [f"{name}_dim{i + 1}" for i in range(len(axes))]
-        own = units[name]
+        own = units[recorded]
         text = own[0] if len(set(own)) == 1 else ", ".join(own)
         variables[name] = (("t", *dims), values, {"units": text} if any(own) else {})
         coordinates |= {dim: (dim, np.arange(1, n + 1), {}) for dim, n in zip(dims, axes, strict=True)}
@@ -136,8 +136,14 @@ def flatten_samples(values: np.ndarray) -> np.ndarray:
     return values.reshape(len(values), int(np.prod(values.shape[1:])))
 
 
+def name_next_to_time(name: str) -> str:
+    """Return the name under which a signal goes out: of a wire called t, as the times are, that of `to_mat`, s_t."""
+    return "s_t" if name == "t" else name
+
+
 def column_labels(name: str, shape: tuple[int, ...]) -> list[str]:
     """Return the names of a signal's columns."""
+    name = name_next_to_time(name)
     return [name] if shape == () else [f"{name}[{i + 1}]" for i in range(int(np.prod(shape)))]
 
 

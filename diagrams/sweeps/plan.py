@@ -24,8 +24,10 @@ REFUSED = {
     "overwrite": "of a sweep, overwrite= belongs to its folder",
 }
 """Options of a run that a sweep has itself, with what to write."""
-_TAKEN = ("failed", "failure", "end_time", "sample", "step", "t")
-"""Names that the data set of a sweep has for itself."""
+_VARIABLES = ("failed", "failure", "end_time", "t")
+"""Variables that the data set of a sweep has for itself."""
+_TAKEN = (*_VARIABLES, "sample", "step")
+"""These, and names of its dimensions, which a signal's path may have, `step.y`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +153,13 @@ def check_names(plan: Plan, swept: Sequence[str]) -> None:
             "name.",
             block=plan.diagram.name,
             port="reduce",
+        )
+    if taken := [name for name in plan.signals if name in _VARIABLES]:
+        raise OptionError(
+            f"found a signal called {taken[0]!r}; the results have something else by that name. Give it by the path of "
+            "its port.",
+            block=plan.diagram.name,
+            port="signals",
         )
 
 

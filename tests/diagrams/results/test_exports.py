@@ -12,8 +12,8 @@ import pytest
 import xarray
 from scipy.io import loadmat
 
-from loopwright.blocks import OptionError, UnknownNameError
-from loopwright.diagrams import Run
+from loopwright.blocks import OptionError, Sine, UnknownNameError
+from loopwright.diagrams import Diagram, Run
 from loopwright.diagrams.results import RecordedSignals
 from loopwright.diagrams.results import run_exports as _exports
 from loopwright.types import Layout, Wire
@@ -240,3 +240,15 @@ def test_a_library_that_is_missing_is_named_with_what_to_install(run, library, e
     text = rf'this export needs {library}, which is not installed\. Install it: pip install "loopwright\[export\]"'
     with pytest.raises(OptionError, match=text):
         export(run)
+
+
+def test_a_wire_called_as_the_times_are_has_a_column_and_they_have_theirs(tmp_path):
+    """Two columns of one name are read as one, or not at all; MATLAB's files have the same name for it."""
+    run = Diagram("d", Sine(frequency=1.0)().named("t")).simulate(0.5, step=0.125, progress=False)
+    run.to_csv(tmp_path / "run.csv", "t")
+    run.to_parquet(tmp_path / "run.parquet", "t")
+    tables = run.to_pandas("t"), run.to_xarray("t"), pandas.read_parquet(tmp_path / "run.parquet")
+    for table in (*tables, pandas.read_csv(tmp_path / "run.csv")):
+        np.testing.assert_array_equal(table["s_t"], run["t"])
+    assert [*tables[2]] == ["t", "s_t"]
+    np.testing.assert_array_equal(tables[2]["t"], run.t)

@@ -466,6 +466,14 @@ def test_what_does_not_fit_is_refused_before_the_first_run(options, message, mon
         sampled_lag().sweep({"step.values": (1.0, 2.0)}, 0.1, **QUIET, **options)
 
 
+def test_a_signal_called_as_the_times_are_is_kept_by_its_path():
+    diagram = Diagram("d", Ramp(slope=1.0, name="ramp")().named("t"))
+    with pytest.raises(OptionError, match=r"^d\.signals: found a signal called 't'; .* by the path of its port"):
+        diagram.sweep({"ramp.slope": (1.0, 2.0)}, 0.1, signals="t", step=0.1, progress=False)
+    found = diagram.sweep({"ramp.slope": (1.0, 2.0)}, 0.1, signals="ramp.y", step=0.1, **INTERPRETED)
+    np.testing.assert_allclose(found.dataset["ramp.y"], [[0.0, 0.1], [0.0, 0.2]], rtol=1e-15)
+
+
 def test_samples_that_fill_the_memory_are_refused():
     with pytest.raises(OptionError, match=r"lag.signals: found 1000 samples .* GiB.*reduce="):
         sampled_lag().sweep({"step.values": np.arange(1e3)}, 1e4, signals="y", **QUIET)
