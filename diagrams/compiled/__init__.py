@@ -29,7 +29,7 @@ from .loop_over_time import (
     Sign,
     Span,
 )
-from .model_exchange_hand_over import HandedOver
+from .model_exchange_hand_over import ModelExchangeHandOver
 from .model_exchange_in_c import NativeModelExchange, OwnEvent
 from .newton import NewtonOptions
 from .plants_called_back import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
@@ -50,10 +50,10 @@ __all__ = [
     "Domains",
     "Fired",
     "FusedPlant",
-    "HandedOver",
     "Kernel",
     "Lost",
     "MethodOptions",
+    "ModelExchangeHandOver",
     "NamedCode",
     "NativeModelExchange",
     "NewtonOptions",

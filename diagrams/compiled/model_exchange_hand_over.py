@@ -17,7 +17,7 @@ _DONE, _NOT_COMPUTED = range(2)
 _FIRED = -1
 
 
-class HandedOver:
+class ModelExchangeHandOver:
     """Blocks in model exchange, in a run that continues in C.
 
     Evaluators do what C can't. ``report`` is called with events of the blocks' own; ``count(t, path, name)`` notes one,

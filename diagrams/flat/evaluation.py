@@ -146,23 +146,8 @@ class Instant:
     ) -> None:
         """Evaluate all blocks; called once, by `evaluate`."""
         layout, table, traced = self.layout, self.layout.table, self.functions.traced
-        for name, where in layout.plant_outputs.slices.items():
-            self._put(layout.ports[name], rows(self.w, where))
         acts = {path: self._acts(table.subsystem_of[path]) for path in traced}
-        for name, where in layout.held.slices.items():
-            path, port = layout.ports[name]
-            if not acts[path]:
-                self._put((path, port), rows(self.x, where))
-        for name, where in layout.log.slices.items() if self.kept is not None else ():
-            path, port = layout.ports[name]
-            if path in acts and not acts[path] and (path, port) not in self.values:
-                self._put((path, port), rows(self.kept, where))
-        torn = {}
-        for name, where in layout.loops.slices.items():
-            path, port = layout.ports[name]
-            if acts[path]:
-                torn[path, port] = rows(self.x, where)
-                self._put((path, port), torn[path, port])
+        torn = self._put_known(acts)
         steps = [*order]
         last = {(path, name): i for i, (path, names) in enumerate(steps) for name in names}
         for i, (path, names) in enumerate(steps):
@@ -184,12 +169,38 @@ class Instant:
                     self.guards += [choose(gate, column, np.ones(len(trace.guards)))] if trace.guards else []
                 else:
                     self._output(path, name, column, gate, torn)
+        # Subsystems without blocks remember their control, too.
         for subsystem in layout.gates.slices:
             if self._acts(subsystem):
-                self.is_open(subsystem)  # one without blocks remembers, too
+                self.is_open(subsystem)
         for path in layout.starts.slices:  # blocks of another rate than the subsystem that resets them
             if not acts[path] and any(self._resets(subsystem) for subsystem in layout.around[table.subsystem_of[path]]):
                 self.new[path] = self._state(path)
+
+    def _put_known(self, acts: Mapping[str, bool]) -> dict[tuple[str, str], Any]:
+        """Put the outputs that are known before any block is evaluated; return those at which loops are torn.
+
+        These are the outputs of plants, those that blocks hold which don't act (or put out at the last tick), and the
+        values of algebraic loops.
+        """
+        layout = self.layout
+        for name, where in layout.plant_outputs.slices.items():
+            self._put(layout.ports[name], rows(self.w, where))
+        for name, where in layout.held.slices.items():
+            path, port = layout.ports[name]
+            if not acts[path]:
+                self._put((path, port), rows(self.x, where))
+        for name, where in layout.log.slices.items() if self.kept is not None else ():
+            path, port = layout.ports[name]
+            if path in acts and not acts[path] and (path, port) not in self.values:
+                self._put((path, port), rows(self.kept, where))
+        torn = {}
+        for name, where in layout.loops.slices.items():
+            path, port = layout.ports[name]
+            if acts[path]:
+                torn[path, port] = rows(self.x, where)
+                self._put((path, port), torn[path, port])
+        return torn
 
     def _acts(self, subsystem: str) -> bool:
         clock = self.layout.clocks.get(subsystem)

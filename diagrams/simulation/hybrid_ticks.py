@@ -14,7 +14,7 @@ from ...blocks.core import SimulationError
 from ..compiled import (
     CompiledHybrid,
     DiagramCode,
-    HandedOver,
+    ModelExchangeHandOver,
     Outcome,
     ReturnReason,
     Sign,
@@ -51,7 +51,7 @@ class HybridTicks(TicksInC[CompiledHybrid]):
         self._sampled = every or not self._clocks or EVERY in self._clocks
         lands = continuous.fixed or bool(plants.entries) or continuous.lands
         self._lands = lands or not self._sampled
-        self._handed: HandedOver | None = None
+        self._handed: ModelExchangeHandOver | None = None
 
     @property
     def messages(self) -> tuple[str, ...]:  # noqa: D102 - as in the base
@@ -264,7 +264,7 @@ class HybridTicks(TicksInC[CompiledHybrid]):
         self._handed = (
             None
             if blocks is None or own is None
-            else HandedOver(
+            else ModelExchangeHandOver(
                 self._flat,
                 blocks.blocks,
                 blocks.evaluators,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.diagrams import Diagram
-from loopwright.diagrams.compiled.model_exchange_hand_over import HandedOver
+from loopwright.diagrams.compiled.model_exchange_hand_over import ModelExchangeHandOver
 from loopwright.fmus import Fmu, bouncing_ball
 
 TIGHT = {"rtol": 1e-8, "atol": 1e-10, "progress": False}
@@ -13,13 +13,13 @@ TIGHT = {"rtol": 1e-8, "atol": 1e-10, "progress": False}
 @pytest.fixture
 def returns(monkeypatch):
     """Times in s at which Python has looked at an FMU for C."""
-    found, look = [], HandedOver._look
+    found, look = [], ModelExchangeHandOver._look
 
     def noted(self, path, t, call):
         found.append(t)
         look(self, path, t, call)
 
-    monkeypatch.setattr(HandedOver, "_look", noted)
+    monkeypatch.setattr(ModelExchangeHandOver, "_look", noted)
     return found
 
 
