@@ -1,4 +1,18 @@
-"""Linear models, operating points and trim."""
+"""Linear models, operating points and trim.
+
+Slopes come from these places. They meet in `LocalDerivatives` (an instant), in `Chain` (ticks, one after the other),
+and in `model_at`, which makes the linear models:
+
+- equations of blocks: CasADi's derivatives of the diagram's functions (`derivatives`); those of one block
+  (`block_slopes`), with its kinks (`kinks`) and the mean slopes of its stairs (`mean_stairs`);
+- FMUs in model exchange: the evaluators of those functions (`exchanged`);
+- FMUs that step: their equations, differences of their steps, or models identified from responses (`plant_models`,
+  `identification`), by `fmus.running`; with a coupling that acts within a step `coupled_chain`;
+- transport delays: channels around a continuous model (`flow_model`), signals of the past in a sampled one
+  (`delayed_flow`);
+- parameters: slopes that travel with every number (`derivatives_along`); of start values of FMUs differences of whole
+  models (`parameter_slopes`).
+"""
 
 from .block_slopes import linearize_block
 from .derivatives import moves_between_ticks

@@ -47,13 +47,13 @@ from ..linearization import (
     carry_point,
     cut_to,
     find_signal,
-    ticks_to_renewal,
 )
 from ..solvers import FIXED
 from .beginning import EXACT, find_beginning, find_continuous_beginning
 from .between_samples import moves_between
 from .injection import InjectionRun, inject_signal
 from .measurement import Measurement, measure_part, refine_tolerances
+from .samples import Samples
 from .waveforms import KINDS, Part, choose_step, plan_signal
 
 if TYPE_CHECKING:
@@ -284,9 +284,10 @@ def frequency_response(
         chosen, point, t0 = find_continuous_beginning(diagram, at, dict(options), choose_step(omega))
     variant = diagram.replace(point.parameters) if point is not None and point.parameters else diagram
     flat = variant.flatten(chosen.get("step", None if point is None or diagram.has_clock else point.base))
-    every = math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
-    period = flat.base * every
-    dt = float(period)
+    signal = find_signal(flat, cut)
+    tick = point.tick if point is not None else round(t0 / float(flat.base))
+    samples = Samples.of(flat, signal, tick) if discrete else Samples(1, flat.base)
+    dt = float(samples.period)
     if not omega[-1] * dt < np.pi:
         raise OptionError(
             f"found {omega[-1]:g} rad/s; expected less than {np.pi / dt:g} rad/s, as there is a sample every {dt:g} s. "
@@ -294,32 +295,28 @@ def frequency_response(
             block=diagram.name,
             port="frequencies",
         )
-    signal = find_signal(flat, cut)
     measured = [find_signal(flat, name) for name in ([outputs] if isinstance(outputs, str) else outputs)]
     if flat.hybrid:
         chosen = {**EXACT, **chosen}
         if chosen.get("solver", "auto") not in FIXED:
             chosen.setdefault("max_step", 0.5 * np.pi / omega[-1])
     plan = list(plan_signal(kind, omega, dt, amplitude))
-    tick = point.tick if point is not None else round(t0 / float(flat.base))
-    wait = ticks_to_renewal(flat, [signal.port], tick) if discrete and every > 1 else 0  # as for the linear model
-    held = (period, ((tick + wait) % every) * flat.base) if discrete else None
-    made = inject_signal(diagram, signal, len(plan[0].waveform.amplitude), held)
+    made = inject_signal(diagram, signal, len(plan[0].waveform.amplitude), samples.held)
     lines = np.concatenate([part.omega for part in plan])
 
     def measure(plan: Sequence[Part], order: Iterable[int], chosen: Mapping[str, Any], amplitude: float) -> Measurement:
         found = Measurement(len(lines), len(signal.entries), sum(len(o.entries) for o in measured))
         for j, entry in enumerate(signal.entries):
             with InjectionRun(diagram, made, signal, measured, t0 if point is None else point, chosen) as run:
-                if wait:
-                    run.go(wait, 1)
+                if samples.wait:
+                    run.go(samples.wait, 1)
                 before, began = run.read_states(), run.t
                 found.largest = GROWN * max(amplitude, float(np.max(np.abs(before), initial=0.0)))
                 for i in order:
-                    measure_part(run, plan[i], entry, j, every, windows, agreement, found, i)
+                    measure_part(run, plan[i], entry, j, samples.every, windows, agreement, found, i)
                 run.play(plan[0].silence, entry, ramp=1.0)
-                run.go(plan[0].samples, every)
-                found.note_movement(run, before, began, plan[0].samples, every)
+                run.go(plan[0].samples, samples.every)
+                found.note_movement(run, before, began, plan[0].samples, samples.every)
         return found
 
     found = measure(plan, range(len(plan)), chosen, float(amplitude))

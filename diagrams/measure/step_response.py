@@ -18,19 +18,17 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, SimulationError, accepts, brief, explain_calls, kinds
-from ..flat import FlatDiagram, WiredDiagram
+from ..flat import WiredDiagram
 from ..linearization import (
     EQUILIBRIUM,
     Linearization,
     PointLike,
-    Tap,
     find_signal,
     hold_sources,
     linearize,
     operating_point,
     refine_ticks,
     ticks_between_renewals,
-    ticks_to_renewal,
 )
 from ..results import ExpectedStep, OperatingPoint
 from ..wiring import stepped_blocks
@@ -38,6 +36,7 @@ from .beginning import can_start_at, with_ticks
 from .between_samples import BETWEEN, SMOOTH, Instants, WithinSamples, can_step_finer, choose_instants, moves_between
 from .injection import InjectionRun, inject_signal
 from .predicted_step import Predicted, find_final, predict, predict_within
+from .samples import Samples
 
 SAMPLES = 1000
 """Samples of the response of a diagram that is not sampled."""
@@ -205,31 +204,35 @@ def step_response(
         )
     names = list(outputs)
     taps = [find_signal(flat, name) for name in names]
-    samples = Samples.of(flat, signal, begins, length, None if sampled else longest)
+    if sampled:
+        samples = Samples.of(flat, signal, begins.tick, each_renewal=True)
+    else:
+        samples = Samples(int(longest / flat.base), flat.base * int(longest / flat.base))
+    count = max(2, math.ceil(length / float(samples.period)) + sampled)  # a step that is held begins a sample later
     # Signals that move on between the samples are read there, too, as far as FMUs take steps so short.
     follows = [flat.table.blocks[tap.port[0]].stepped or moves_between(flat, tap.port) for tap in (signal, *taps)]
     moves = np.repeat(follows, [1, *(len(tap.labels) for tap in taps)]) & sampled
     instants, unread = Instants(), tuple[str, ...]()
     within: WithinSamples | None = None
     if moves.any():
-        instants = choose_instants(variant, begins, samples.every, samples.count)
+        instants = choose_instants(variant, begins, samples.every, count)
         if samples.is_renewed_once and (not diagram.has_fmu or instants.turns > SMOOTH):
             within = WithinSamples.of(variant, begins, instants.looked, wire, names, len(moves), stairs)
         if diagram.has_fmu:
-            moving = within is not None and within.moves_by(samples.count, moves) > BETWEEN
+            moving = within is not None and within.moves_by(count, moves) > BETWEEN
             unread = tuple(stepped_blocks(diagram.structure)) if moving else ()
             instants = instants if moving and can_step_finer(diagram) else Instants()
     begins = refine_ticks(variant, begins, instants.finer)
     options: dict[str, Any] = {"step": None if diagram.has_clock and instants.finer == 1 else begins.base}
     if flat.hybrid:
         options |= {"rtol": 1e-9, "atol": 1e-12}
-        if sampled and samples.count * samples.every >= LONG:
+        if sampled and count * samples.every >= LONG:
             options["compile"] = True
     made = inject_signal(variant, signal, 1, samples.held)
 
     def run_with(height: float) -> tuple[np.ndarray, np.ndarray, bool]:
         with InjectionRun(variant, made, signal, taps, begins, options) as run:
-            return _record(run, samples, instants, height, size)
+            return _record(run, samples, count, instants, height, size)
 
     # What the diagram does by itself is taken off.
     rest, _, _ = run_with(0.0)
@@ -277,45 +280,8 @@ def step_response(
     )
 
 
-@dataclass(frozen=True)
-class Samples:
-    """Samples of a response, from one to the next of which a sampled diagram's test signal is held."""
-
-    every: int  # ticks in a sample
-    period: Fraction  # s
-    count: int  # of all samples
-    wait: int = 0  # ticks until the wire is renewed
-    renewals: int = 1  # of the wire in the period of all clocks
-    held: tuple[Fraction, Fraction] | None = None  # period of the test signal and its first time, where it is held
-
-    @classmethod
-    def of(
-        cls, flat: FlatDiagram, signal: Tap, begins: OperatingPoint, length: float, longest: Fraction | None
-    ) -> Samples:
-        """Return the samples of a response of a length in s; ``longest`` is one of them where nothing is sampled.
-
-        The sample of a wire that is renewed several times in the period of all clocks is from one renewal to the next.
-        """
-        if longest is not None:
-            every = int(longest / flat.base)
-            return cls(every, flat.base * every, max(2, math.ceil(length / float(flat.base * every))))
-        every = math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
-        own = ticks_between_renewals(flat, [signal.port]) if every > 1 else None
-        renewals = every // own if own and every % own == 0 else 1
-        every //= renewals
-        wait = ticks_to_renewal(flat, [signal.port], begins.tick) if every > 1 else 0
-        period = flat.base * every
-        count = max(2, math.ceil(length / float(period)) + 1)  # a step that is held begins a sample later
-        return cls(every, period, count, wait, renewals, (period, ((begins.tick + wait) % every) * flat.base))
-
-    @property
-    def is_renewed_once(self) -> bool:
-        """Whether the wire is renewed at the beginning of the period of all clocks, and then alone."""
-        return not self.wait and self.renewals == 1
-
-
 def _record(
-    run: InjectionRun, samples: Samples, instants: Instants, height: float, size: float
+    run: InjectionRun, samples: Samples, count: int, instants: Instants, height: float, size: float
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """Return v and the outputs at all instants of a run, the step as the consumers got it, and whether v is held.
 
@@ -330,9 +296,9 @@ def _record(
         run.step(height, run.signal.entries[0])
     largest = GROWN * max(abs(size), float(np.max(np.abs(first[0]))))
     done = 0
-    while done < samples.count:
-        some = run.record(min(CHUNK, samples.count - done), ticks, parts)
-        done += min(CHUNK, samples.count - done)
+    while done < count:
+        some = run.record(min(CHUNK, count - done), ticks, parts)
+        done += min(CHUNK, count - done)
         found.append(tuple(part[1:] for part in some) if len(found) > 1 else some)
         if not float(np.max(np.abs(some[0]))) <= largest:
             raise DivergenceError(
