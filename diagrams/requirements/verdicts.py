@@ -151,6 +151,7 @@ def make_limit(name: str, given: Any, sense: Sense | None, port: str = "") -> Li
         end = float(ends[0])
         if math.isinf(end):
             raise OptionError(f"found {given!r}, which limits nothing; expected {expected}. Leave it out.", port=where)
+        _refuse_vacuous(name, end, where)
         return Limit(end, math.inf) if sense is Sense.LEAST else Limit(-math.inf, end)
     low, high = map(float, ends)
     if not low <= high or (low == -math.inf and high == math.inf) or low == math.inf or high == -math.inf:
@@ -159,6 +160,23 @@ def make_limit(name: str, given: Any, sense: Sense | None, port: str = "") -> Li
             port=where,
         )
     return Limit(low, high)
+
+
+def _refuse_vacuous(name: str, end: float, port: str) -> None:
+    """Refuse a limit that every loop meets, as it is meant in another unit: a share in per cent, a factor in dB."""
+    if name == "overshoot" and end > 1.0:
+        raise OptionError(
+            f"found {end:g}, which is {100.0 * end:g} % of the final change; expected a share of it, up to 1. Give "
+            f"{name} = {end / 100.0:g} for {end:g} %.",
+            port=port,
+        )
+    side = {"gain_margin_high": "above", "gain_margin_low": "below"}.get(name)
+    if (side == "above" and end <= 1.0) or (side == "below" and end >= 1.0):
+        raise OptionError(
+            f"found {end:g}, which every stable loop meets; expected a factor {side} 1. Give gain_margin_high = 2.0, "
+            "which is 6 dB, and gain_margin_low = 0.5 for the one to lower gains.",
+            port=port,
+        )
 
 
 def judge_interval(value: float, low: float, high: float, limit: Limit) -> tuple[Verdict, Reason, float]:

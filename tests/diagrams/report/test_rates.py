@@ -64,7 +64,7 @@ def test_the_fast_wires_step_is_judged_by_its_peak_between_the_slow_samples():
     slow = np.max(answer[::RATIO]) / final - 1
     assert overshoot - slow > 0.01  # what the slow samples don't show
     limit = (overshoot + slow) / 2
-    asked = Requirements(step={"overshoot": limit}, loops={"current_wanted": {"step": {"overshoot": 5.0}}})
+    asked = Requirements(step={"overshoot": limit}, loops={"current_wanted": {"step": {"overshoot": 1.0}}})
     report = analyse(cascade(14.0), only=("poles", "inner", "steps"), requirements=asked)
     found = {(r.loop, r.quantity): r for r in report.review.results}
     result = found["voltage", "step.overshoot"]

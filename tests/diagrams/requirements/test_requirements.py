@@ -123,6 +123,16 @@ def test_the_step_of_a_loop_replaces_the_general_one_and_steps_between_wires_sta
         ({"gain_margin_db": 6.0}, "Gain margins are factors: write gain_margin_high=1.995, which is 6 dB"),
         ({"gain_margin": 2.0}, "write gain_margin_high=2.0, which is 6 dB, and gain_margin_low=0.5"),
         ({"overshoot": 0.1}, "It is one of a step response: step={'overshoot': 0.1}"),
+        ({"step": {"overshoot": 10}}, "step.overshoot: found 10, which is 1000 % of the final change"),
+        ({"step": {"overshoot": 10}}, "Give overshoot = 0.1 for 10 %."),
+        (
+            {"gain_margin_high": 0.5},
+            "gain_margin_high: found 0.5, which every stable loop meets; expected a factor above 1",
+        ),
+        (
+            {"gain_margin_low": 1.0},
+            "gain_margin_low: found 1, which every stable loop meets; expected a factor below 1",
+        ),
         ({"settling_time": 0.5}, "It is one of a step response: step={'settling': 0.5}"),
         ({"ms": "1.6"}, "ms: found '1.6'; expected a number (at most), or two: low and high"),
         ({"ms": True}, "ms: found True; expected a number"),
