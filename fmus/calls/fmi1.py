@@ -54,7 +54,6 @@ class Fmi1Calls(FmiCalls):
     def instantiate(self, log: Log) -> None:
         """Make the instance; its messages go to ``log``. Memory is the C library's (3.2)."""
         callbacks, self._logger = make_callbacks("fmi1", log)
-        callbacks.stepFinished = None
         self.fmu.instantiate(functions=callbacks, loggingOn=True)
         if not self.fmu.component:
             raise RuntimeError(f"fmiInstantiate{'Model' if self.is_model else 'Slave'} returned nothing")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from ..isolation import InputLines
 from .event_calls import AnswersAt, EventCalls
 from .fmi_calls import FmiCalls, FmiVersion, Log, TypeCalls
 
@@ -37,7 +37,7 @@ class Fmi3Calls(FmiCalls):
         states="FMUState",
         update="updateDiscreteStates",
     )
-    _line: tuple[np.ndarray, Any, Any] | None = None
+    _lines: InputLines | None = None
 
     def instantiate(self, log: Log) -> None:
         """Make the instance; its messages go to ``log``."""
@@ -68,23 +68,14 @@ class Fmi3Calls(FmiCalls):
 
     def _follow(self, line: np.ndarray, references: Sequence[int], n: int) -> None:
         """Let inputs be set from a line when the FMU asks for that; see `slope_line`."""
-        self._line = line, (ctypes.c_uint * len(references))(*references), (ctypes.c_double * n)()
+        numbers = (ctypes.c_double * line.size).from_address(line.ctypes.data)
+        self._kept = line
+        self._lines = InputLines(numbers, references, self.instance_argument, self.fmu.dll["fmi3SetFloat64"])
 
-    def _update_inputs(self, environment: Any, t: float, set_requested: bool, *others: Any) -> None:
+    def _update_inputs(self, environment: Any, t: float, can_set: bool, *others: Any) -> None:
         """Set the inputs at a time within a step; called by the FMU."""
-        if not set_requested or self._line is None:
-            return
-        line, references, values = self._line
-        n = len(values)
-        values[:] = line[2 : 2 + n] + line[2 + n :] * (t - line[0])
-        line[1] = max(line[1], self._set_inputs(self.fmu.component, references, len(references), values, n))
-
-    @cached_property
-    def _set_inputs(self) -> Callable[..., int]:
-        function = ctypes.CFUNCTYPE(
-            ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t
-        )
-        return function(("fmi3SetFloat64", self.fmu.dll))
+        if can_set and self._lines is not None:
+            self._lines.set_at(t)
 
     def event_calls(self) -> EventCalls:
         """Return the functions of events in model exchange (FMI 3.0, 2.3.5 and 3.2), with their own memory."""

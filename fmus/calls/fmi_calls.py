@@ -20,7 +20,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from ...blocks.core import FmuProcessError
-from ..isolation import Logger, format_message
+from ..isolation import log_and_memory
 from .bound_calls import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING, BoundCalls, Call
 from .event_calls import EventCalls, EventUpdate
 from .library_functions import LibraryFunctions, allow_missing, exported_name
@@ -46,19 +46,9 @@ def call_error_type() -> Any:
 
 
 def make_callbacks(prefix: str, log: Log) -> tuple[Any, Any]:
-    """Return the callbacks of an instance before FMI 3.0, and its logger, to be kept; memory is the C library's."""
-    import fmpy
-
-    def message(environment: Any, name: Any, status: int, category: Any, text: bytes | None, *arguments: Any) -> None:
-        if status:  # the others are not kept
-            log(status, format_message(text or b"", arguments))
-
-    module, logger = import_module(f"fmpy.{prefix}"), Logger(message)
-    callbacks = getattr(module, f"{prefix}CallbackFunctions")()
-    callbacks.logger = ctypes.cast(logger, getattr(module, f"{prefix}CallbackLoggerTYPE"))
-    callbacks.allocateMemory = getattr(module, f"{prefix}CallbackAllocateMemoryTYPE")(fmpy.calloc)
-    callbacks.freeMemory = getattr(module, f"{prefix}CallbackFreeMemoryTYPE")(fmpy.free)
-    return callbacks, logger
+    """Return the callbacks of an instance before FMI 3.0, as FMPy's structure, and what must live as long as it."""
+    pointers, logger = log_and_memory(log)
+    return getattr(import_module(f"fmpy.{prefix}"), f"{prefix}CallbackFunctions").from_buffer_copy(pointers), logger
 
 
 @dataclass(frozen=True)

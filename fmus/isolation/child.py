@@ -19,7 +19,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from . import printf, wire
+from . import wire
+from .callbacks import InputLines, log_and_memory
 from .in_c import TYPES, Server, make_watch
 from .surroundings import forget, has_room, kill_group, limit, look_around, move, print_to, resident
 from .wire import (
@@ -66,8 +67,7 @@ class Child:
         self.server: Server | None = None
         """Waits for requests in C; None before `do_run_in_c`."""
         self.before: list[Any] = []
-        self.line: Any = None
-        """Inputs that follow lines within a step: start, status, values and slopes, then references, instance."""
+        self.lines: InputLines | None = None
         self._logging = threading.Lock()
 
     # ---- requests ----
@@ -261,21 +261,15 @@ class Child:
         self, place: int, references: list[int], n: int, instance: int, blobs: list[bytes]
     ) -> tuple[None, list[bytes]]:
         """Let inputs follow lines within a step; the parent writes them and the instance to the shared memory."""
-        numbers, values = (ctypes.c_double * (2 + 2 * n)).from_buffer(self.memory, place), (ctypes.c_double * n)()
+        numbers = (ctypes.c_double * (2 + 2 * n)).from_buffer(self.memory, place)
         component = ctypes.c_void_p.from_buffer(self.memory, instance)
-        self.line = numbers, (ctypes.c_uint * len(references))(*references), component, values
+        self.lines = InputLines(numbers, references, component, self.library["fmi3SetFloat64"])
         return None, []
 
     def _update_inputs(self, environment: Any, t: float, can_set: bool, *others: Any) -> None:
         """Set the inputs at a time within a step; called by the FMU."""
-        if not can_set or self.line is None:
-            return
-        numbers, references, component, values = self.line
-        n, size = len(values), ctypes.c_size_t
-        for i in range(n):
-            values[i] = numbers[2 + i] + numbers[2 + n + i] * (t - numbers[0])
-        status = self.library["fmi3SetFloat64"](component, references, size(len(references)), values, size(n))
-        numbers[1] = max(numbers[1], status & 0xFFFFFFFF)
+        if can_set and self.lines is not None:
+            self.lines.set_at(t)
 
     def do_unload(self, blobs: list[bytes]) -> tuple[list[str], list[bytes]]:
         """Unload the library, and return traces of the FMU in this process: with any, it is used no more."""
@@ -283,7 +277,7 @@ class Child:
         self.bound.clear()
         if self.server is not None:
             self.server.take([])
-        self.line = None
+        self.lines = None
         handle, self.library = self.library._handle, None
         self.kept.clear()
         if sys.platform == "win32":
@@ -324,22 +318,15 @@ class Child:
             kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
             return self._keep(kind(message3))
 
-        def message(environment: Any, name: Any, status: int, category: Any, text: bytes | None, *more: Any) -> None:
-            if status:
-                self._keep_message(status, printf.format_message(text or b"", more))
-
-        c_library = ctypes.CDLL(None) if sys.platform != "win32" else ctypes.cdll.msvcrt
-        calloc, free = (ctypes.cast(getattr(c_library, n), ctypes.c_void_p).value for n in ("calloc", "free"))
-        logger = self._keep(printf.Logger(message))
-        address = ctypes.cast(logger, ctypes.c_void_p).value
-        callbacks = self._keep((ctypes.c_void_p * 5)(address, calloc, free, None, None))
+        pointers, logger = log_and_memory(self._keep_message)
+        self._keep(logger)
         if version == 1:
 
             class Callbacks(ctypes.Structure):
                 _fields_ = (("pointers", ctypes.c_void_p * 4),)
 
-            return self._keep(Callbacks.from_buffer_copy(callbacks))
-        return callbacks
+            return self._keep(Callbacks.from_buffer_copy(pointers))
+        return self._keep(pointers)
 
     def _keep(self, value: Any) -> Any:
         self.kept.append(value)
