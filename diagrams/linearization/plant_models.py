@@ -168,10 +168,10 @@ def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> l
             block=plant_paths(flat)[0],
             port="plants",
         )
-    return [_plant_model(flat, path, linearize_equations(flat, at, path, at.z)) for path in plant_paths(flat)]
+    return [plant_model(flat, path, linearize_equations(flat, at, path, at.z)) for path in plant_paths(flat)]
 
 
-def _plant_model(flat: FlatDiagram, path: str, m: FmuLinearization, **more: Any) -> PlantModel:
+def plant_model(flat: FlatDiagram, path: str, m: FmuLinearization, **more: Any) -> PlantModel:
     """Return a linear model of an FMU by its entries in z and w, of those inputs alone that are wired."""
     z, w, wired = plant_entries(flat, path)
     return PlantModel(
@@ -231,7 +231,7 @@ def model_step(
             # the step's own derivatives are those of the outputs after it, by the states before it
             m, after = replace(step, C=C, D=D), (step.C, step.D[:, plant_entries(flat, path)[2]])
     following = {**now, "t": now["t"] + h, "state": _states_after(block, now, m.f)}
-    return _plant_model(flat, path, m, y_next=m.y0, next=following, after=after)
+    return plant_model(flat, path, m, y_next=m.y0, next=following, after=after)
 
 
 def _identify_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float) -> PlantModel:

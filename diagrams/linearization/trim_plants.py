@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..wiring import change_parameter, join
 from .delay_channels import delay_channels
 from .exchanged import evaluators_at, load_evaluators
 from .identification import WATCHED, output_drift
-from .plant_models import plant_entries, plant_layout
+from .plant_models import PlantModel, join_matrices, plant_entries, plant_layout, plant_model, plant_point
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
@@ -97,16 +97,13 @@ class Plants:
 
     def point(self, path: str, block: Fmu, xp: np.ndarray, z: np.ndarray) -> dict[str, Any]:
         """Return time, states and inputs of an FMU, the arguments of its linear models."""
-        start, flat = self.at_start.plants[path], self.flat
-        state, inputs = {**start["state"], **self.states.of_block[path].split(xp)}, dict(start["inputs"])
-        variables = block.input_variables
-        for port in block.inputs:
-            where = flat.plant_inputs.slices.get(join(path, port))
-            if where is not None:
-                inputs[port] = z[where].reshape(np.shape(inputs[port]))
-            elif variables[port].name in block.start:
-                inputs[port] = np.reshape(block.start[variables[port].name], np.shape(inputs[port]))
-        return {"t": start["t"], "state": state, "inputs": inputs}
+        now = plant_point(self.flat, self.at_start, path, z)
+        inputs = dict(now["inputs"])
+        for port, variable in block.input_variables.items():
+            if variable.name in block.start and join(path, port) not in self.flat.plant_inputs.slices:
+                inputs[port] = np.reshape(block.start[variable.name], np.shape(inputs[port]))
+        state = {**now["state"], **self.states.of_block[path].split(xp)}
+        return {"t": now["t"], "state": state, "inputs": inputs}
 
     def points(self, xp: np.ndarray, z: np.ndarray, changed: Mapping[str, Fmu]) -> dict[str, Any]:
         """Return time, states and inputs of all FMUs by path; ``changed`` holds FMUs with other parameters."""
@@ -161,18 +158,15 @@ class Plants:
         At rest a dead time puts out its input; else it puts out what it does where the search begins.
         """
         flat, n = self.flat, self.total
-        nw, nz = flat.plant_outputs.total, flat.plant_inputs.total
-        f, y = np.zeros(n), np.zeros(nw)
-        A, B, C, D = np.zeros((n, n)), np.zeros((n, nz)), np.zeros((nw, n)), np.zeros((nw, nz))
+        nw = flat.plant_outputs.total
+        f, y, models = np.zeros(n), np.zeros(nw), list[PlantModel]()
         changed = self.change_blocks(free, q)
         for path, own in self.own.items():
             m, f[own] = self._evaluate_one(path, changed.get(path, self.blocks[path]), xp, z)
-            mine, w, wired = plant_entries(flat, path)
-            y[w] = m.y0
-            A[own, own] = m.A - np.eye(len(m.A)) if self.by_step[path] else m.A
-            B[own, mine] = m.B[:, wired]
-            C[w, own] = m.C
-            D[np.ix_(w, mine)] = m.D[:, wired]
+            m = replace(m, A=m.A - np.eye(len(m.A))) if self.by_step[path] else m
+            models.append(plant_model(flat, path, m))
+            y[models[-1].outputs] = m.y0
+        A, B, C, D = (join_matrices(flat, models, which) for which in "ABCD")
 
         def evaluate(i: int, others: list[np.ndarray]) -> list[np.ndarray]:
             path, rates, outputs = free[i].path, np.zeros(n), np.zeros(nw)
