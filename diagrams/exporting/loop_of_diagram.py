@@ -35,12 +35,12 @@ from ..flat import NONE, FlatDiagram, TickPattern, bits_of, flatten, has_all_kin
 from ..model_exchange import BlocksInModelExchange
 from ..simulation import (
     Continuous,
+    Initialization,
     RunOptions,
     Workspace,
     bind_hybrid,
     bind_ticks,
     find_start_values,
-    initialize,
 )
 from ..solvers import METHODS, MethodKind
 from ..wiring import Wire, exact_time, join
@@ -243,7 +243,7 @@ def _start(opened: OpenDiagram, flat: FlatDiagram) -> Workspace:
         bind(flat, plants, workspace.z, workspace.here.w)
         exchanged, passes_on = BlocksInModelExchange(flat), "agree" if plants else "none"
         try:
-            initialize(workspace, plants, None, lambda: None, exchanged, passes_on, find_start_values)
+            Initialization(workspace, plants, None, lambda: None, exchanged, passes_on, find_start_values).find()
         except SimulationError as error:
             raise error.at(t=0.0) from error.__cause__
     for path, values in opened.states.items():

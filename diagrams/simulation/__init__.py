@@ -6,13 +6,14 @@ from .continuous import Continuous
 from .engine import Engine
 from .failed_blocks import START_SETTLED
 from .held_inputs import note_held_inputs
-from .initialize import find_initial_state, find_start_values, initialize, values_from_left
+from .initialize import Initialization
 from .live_run import LiveRun
 from .progress import Interrupted, ProgressOption, late_progress, progress_bar, work_notes
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
 from .simulation import Simulation, simulate
 from .solver_setup import find_late, next_instant
 from .start_at_point import apply_point, copy_states
+from .start_values import find_initial_state, find_start_values, values_from_left
 from .stops import StopConditions
 from .traced_start_values import Port, StartFunctions, StartValues, trace_start
 from .view import SimulationView
@@ -23,6 +24,7 @@ __all__ = [
     "START_SETTLED",
     "Continuous",
     "Engine",
+    "Initialization",
     "Interrupted",
     "KeptKeywords",
     "LiveRun",
@@ -44,7 +46,6 @@ __all__ = [
     "find_initial_state",
     "find_late",
     "find_start_values",
-    "initialize",
     "late_progress",
     "newton_options",
     "next_instant",

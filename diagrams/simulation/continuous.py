@@ -16,7 +16,6 @@ from ..model_exchange import BlocksInModelExchange, OwnEvents
 from ..results import Occurrence
 from ..solvers import METHODS, Method, MethodKind, Problem
 from .failed_blocks import state_values
-from .initialize import domains_from_left
 from .solver_setup import (
     absolute_tolerances,
     find_late,
@@ -26,6 +25,7 @@ from .solver_setup import (
     scales_of,
     time_scale_of,
 )
+from .start_values import domains_from_left
 from .workspace import Workspace
 
 _AT_ONCE = 1e-6

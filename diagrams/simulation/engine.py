@@ -25,11 +25,12 @@ from .continuous import Continuous
 from .continuous_part import ContinuousPart
 from .failed_blocks import opaque_failure
 from .hybrid_ticks import HybridTicks
-from .initialize import find_start_values, initialize
+from .initialize import Initialization
 from .plants_in_c import PlantsInC
 from .run_options import RunOptions
 from .sampled_ticks import SampledTicks
 from .start_at_point import check_past, start_at, take_over
+from .start_values import find_start_values
 from .stops import StopConditions
 from .ticks_in_c import find_code, functions_of
 from .traced_start_values import choose_start_values
@@ -151,7 +152,9 @@ class Engine:
     def _find_start(self, set_start: Callable[[Workspace], None]) -> None:
         delays = None if self.continuous is None else self.continuous.delays
         take_inputs = self.steps.take_inputs
-        initialize(self.workspace, self.plants, delays, take_inputs, self.exchanged, self._passes_on, set_start)
+        Initialization(
+            self.workspace, self.plants, delays, take_inputs, self.exchanged, self._passes_on, set_start
+        ).find()
         for plant in self.plants.values():
             plant.begin()
         self.exchanged.begin(self.workspace.here.x)

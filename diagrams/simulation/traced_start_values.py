@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import Block
 from ..flat import NONE, FlatDiagram, Instant, bind_function, evaluate, is_true, speed_up
-from .initialize import find_initial_state, find_start_values, values_from_left
+from .start_values import find_initial_state, find_start_values, values_from_left
 from .workspace import Workspace
 
 Port = tuple[str, str]
