@@ -366,13 +366,19 @@ def _variable(port: Port, causality: Any, **more: Any) -> Variable:
     return Variable(name=port.name, causality=causality, unit=unit, description=port.description, **limits, **more)
 
 
-def parameter_variable(block: Block, name: str, value: Any, full: str | None = None) -> Variable:
-    """Return a parameter of a block as a variable, under another name if one is given."""
+def parameter_spec(block: Block, name: str) -> ParameterSpec:
+    """Return the declaration of a parameter of a block, or of one inside it by a name with dots."""
     owner: Any = block
     *outer, last = name.split(".")
     for part in outer:
         owner = owner.__dict__[part]
-    spec: ParameterSpec = type(owner).parameter_specs[last]
+    found: ParameterSpec = type(owner).parameter_specs[last]
+    return found
+
+
+def parameter_variable(block: Block, name: str, value: Any, full: str | None = None) -> Variable:
+    """Return a parameter of a block as a variable, under another name if one is given."""
+    spec = parameter_spec(block, name)
     above = spec.above if spec.above is None else float(np.nextafter(spec.above, np.inf)) if spec.above else _TINY
     return Variable(
         name=full or name,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from .c_code import RUNTIME, runtime
@@ -16,13 +17,27 @@ _OF_FMI = ("fmi2", "fmi3")
 
 def read_own_sources(path: str | os.PathLike[str]) -> dict[str, str] | None:
     """Return the C sources of an FMU that this version of Loopwright has built, on any machine; None for another."""
+    sources = read_packed_sources(path)
+    return sources if "model.c" in sources and are_of_this_version(sources) else None
+
+
+def read_packed_sources(path: str | os.PathLike[str]) -> dict[str, str]:
+    """Return the C sources in an FMU of any tool, by name; none where there is no ``model.c``, as ours have.
+
+    Raises `OSError, BadZipFile` if the file can't be read.
+    """
     with zipfile.ZipFile(Path(path)) as archive:
-        names = {name.removeprefix("sources/"): name for name in archive.namelist() if name.startswith("sources/")}
-        versions = [fmi for fmi in RUNTIME if f"fmi{fmi}.c" in names]
-        if "model.c" not in names or len(versions) != 1:
-            return None
-        sources = {name: archive.read(names[name]).decode() for name in names if name.endswith((".c", ".h"))}
-    return sources if {n: text for n, text in sources.items() if n != "model.c"} == runtime(versions[0]) else None
+        names = [name for name in archive.namelist() if name.startswith("sources/") and name.endswith((".c", ".h"))]
+        if "sources/model.c" not in names:
+            return {}
+        # Sources of other tools have any encoding.
+        return {name.removeprefix("sources/"): archive.read(name).decode(errors="replace") for name in names}
+
+
+def are_of_this_version(sources: Mapping[str, str]) -> bool:
+    """Whether the sources around ``model.c`` are those that this version of Loopwright writes."""
+    around = {name: text for name, text in sources.items() if name != "model.c"}
+    return any(around == runtime(fmi) for fmi in RUNTIME)
 
 
 def expand_sources(name: str, sources: dict[str, str], behind: dict[str, str] | None = None) -> str:

@@ -37,6 +37,7 @@ from ...blocks.tracing import bundle, traced_parameters
 from ..child_processes import find_python, run_in_group, temporary_folder
 from ..platform import record_build
 from .fmu_package import file_for, write_atomically, zip_files
+from .from_block import parameter_spec
 from .html_page import block_text
 from .model_spec import check_file_name
 from .xml_text import package_version, unit_element
@@ -202,7 +203,7 @@ def _values(block: Block, name: str, kind: str) -> dict[str, dict[str, Any]]:
         shapes[key] = given.shape
         put(key, "input", np.broadcast_to(0.0 if given.default is None else given.default, given.shape), given)
     for key, value in traced_parameters(block):
-        put(key, "parameter", value, _declaration(block, key))
+        put(key, "parameter", value, parameter_spec(block, key))
     for key, state in block.states.items():
         put(key, "state", state.start_value(block, shapes), state)
     x, u = (
@@ -256,13 +257,6 @@ def _call_at_start(block: Block, name: str, equation: str, x: Any, u: Any, count
     if len(parts) != count:
         raise DefinitionError(f"its {equation} returned {len(parts)} values; expected {count}.", block=name)
     return parts
-
-
-def _declaration(block: Any, name: str) -> Any:
-    *outer, last = name.split(".")
-    for part in outer:
-        block = block.__dict__[part]
-    return type(block).parameter_specs[last]
 
 
 def _variables(values: dict[str, dict[str, Any]], kind: str) -> list[dict[str, Any]]:

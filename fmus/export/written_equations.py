@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import zipfile
 from collections.abc import Callable, Mapping
@@ -14,7 +13,7 @@ from typing import Any
 import casadi as ca
 
 from ...blocks.core import FmuError
-from .c_code import runtime
+from .own_sources import are_of_this_version, read_packed_sources
 
 _BINARY: Mapping[str, Callable[[Any, Any], Any]] = {
     "+": lambda a, b: a + b,
@@ -115,16 +114,11 @@ def read_equations(path: Path) -> WrittenEquations:
     operations.
     """
     try:
-        with zipfile.ZipFile(os.fspath(path)) as archive:
-            texts = {
-                name.removeprefix("sources/"): archive.read(name).decode()
-                for name in archive.namelist()
-                if name.startswith("sources/") and name.endswith((".c", ".h"))
-            }
-            text = texts.pop("model.c")
+        sources = read_packed_sources(path)
+        text = sources["model.c"]
     except (OSError, KeyError, zipfile.BadZipFile) as error:
         raise FmuError(f"its sources can't be read: {error}. Export it with Loopwright.") from None
-    if texts not in (runtime(3), runtime(2)):
+    if not are_of_this_version(sources):
         raise FmuError("another version of Loopwright has exported it. Export it again.")
     return read_text(text)
 

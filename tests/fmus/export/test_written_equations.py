@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright.fmus import FmuError
-from loopwright.fmus.export import read_equations
+from loopwright.fmus.export import read_equations, read_own_sources
 from loopwright.fmus.export.c_code import generate, runtime
 from loopwright.fmus.export.written_equations import read_text
 from support.exported import mass_spring_damper, pendulums
@@ -125,3 +125,10 @@ def test_sources_of_another_version_are_refused(tmp_path):
     write_sources(tmp_path / "model.fmu", mass_spring_damper(), **{"integrators.c": "/* other steps */"})
     with pytest.raises(FmuError, match="another version of Loopwright has exported it"):
         read_equations(tmp_path / "model.fmu")
+
+
+def test_sources_of_another_tool_may_have_any_encoding(tmp_path):
+    write_sources(tmp_path / "model.fmu", mass_spring_damper())
+    assert read_own_sources(tmp_path / "model.fmu") is not None
+    write_sources(tmp_path / "model.fmu", mass_spring_damper(), **{"fmi3.c": "/* Länge */".encode("latin-1")})
+    assert read_own_sources(tmp_path / "model.fmu") is None
