@@ -25,7 +25,12 @@ from .model_spec import DIRECTIONS, ModelSpec
 
 _SHARED = ("linear.c", "fixed_step.c", "embedded.c", "crossings.c")  # of loopwright.fmus.runtime
 _COMMON = ("model.h", "elementary.c", "core.c", "integrators.c", "events.c", "stepping.c")
-RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
+OF_FMI = {
+    3: ("fmi_calls.c", "fmi3.c", "fmi3_events.c", "fmi3_refused.c"),
+    2: ("fmi_calls.c", "fmi2.c", "fmi2_refused.c"),
+}
+"""Files with FMI's functions, by version."""
+RUNTIME = {fmi: (*_COMMON, *files) for fmi, files in OF_FMI.items()}
 ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
 
 # Longest function that is expanded; beyond it, calls of shared functions keep the code small (compile time grows fast).

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import lru_cache
 
-from .c_code import ORDER, start_table, variable_table
+from .c_code import OF_FMI, ORDER, start_table, variable_table
 from .c_text import c_array
 from .elementary_tables import read_runtime
 from .entries import Entry
@@ -17,7 +17,7 @@ from .loop_entries import loop_layout, loop_rows, offered_clocks
 from .loop_spec import LoopSpec, Placed, write_unit
 
 _COMMON = ("model.h", "core.c", "loop.c")
-RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
+RUNTIME = {fmi: (*_COMMON, *files) for fmi, files in OF_FMI.items()}
 
 
 def generate_loop(spec: LoopSpec, token: str, fmi: int) -> str:

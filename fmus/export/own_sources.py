@@ -8,11 +8,10 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from .c_code import RUNTIME, runtime
+from .c_code import OF_FMI, RUNTIME, runtime
 
 INCLUDE = re.compile(r'^#include "(.*)"$', re.MULTILINE)
 _OURS = re.compile(r"\b(_?(?:lw|LW|casadi|CASADI|eq)_)")
-_OF_FMI = ("fmi2", "fmi3")
 
 
 def read_own_sources(path: str | os.PathLike[str]) -> dict[str, str] | None:
@@ -45,9 +44,10 @@ def expand_sources(name: str, sources: dict[str, str], behind: dict[str, str] | 
 
     ``behind``: texts that come behind sources that are included, by the names of these.
     """
+    of_fmi = {file for files in OF_FMI.values() for file in files}
 
     def include(found: re.Match[str]) -> str:
-        if found[1].startswith(_OF_FMI):
+        if found[1] in of_fmi:
             return ""
         return expand_sources(found[1], sources, behind) + (behind or {}).get(found[1], "")
 

@@ -4,17 +4,17 @@
 #include "fmi2Functions.h"
 
 #define LW_OK(call) ((call) ? fmi2OK : fmi2Error)
+#define LW_EVALUATED(call) ((call) ? fmi2OK : lw_may_try_again(self, mode) ? fmi2Discard : fmi2Error) /* `mode`: before it */
 #define LW_SELF lw_instance *self = c; if (!self) return fmi2Error
 
 /* The logger takes a printf format (FMI 2.0, 2.1.5): a '%' of the text is written as '%%'. */
 static void lw_write_fmi2(lw_instance *self, lw_category category, const char *message) {
     fmi2CallbackLogger log = (fmi2CallbackLogger)self->sink;
-    bool error = category == LW_LOG_ERROR;
     char format[4096], *to = format;
     for (const char *from = message; *from && to < format + sizeof format - 2; *to++ = *from++)
         if (*from == '%') *to++ = '%';
     *to = 0;
-    log(self->environment, self->name, error ? fmi2Error : fmi2Warning, error ? "logStatusError" : "logStatusWarning", format);
+    log(self->environment, self->name, category == LW_LOG_ERROR ? fmi2Error : fmi2Warning, lw_category_name(category), format);
 }
 
 /* ---- versions and logging (FMI 2.0, 2.1.4 and 2.1.5) ---- */
@@ -23,56 +23,26 @@ const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 
 const char *fmi2GetVersion(void) { return fmi2Version; }
 
-static unsigned lw_category_of(const char *name) {
-    if (!strcmp(name, "logAll")) return LW_LOG_WARNING | LW_LOG_ERROR;
-    if (!strcmp(name, "logStatusError")) return LW_LOG_ERROR;
-    return strcmp(name, "logStatusWarning") ? 0 : LW_LOG_WARNING;
-}
-
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean loggingOn, size_t nCategories, const fmi2String categories[]) {
     LW_SELF;
-    if (!categories) nCategories = 0;
-    unsigned chosen = nCategories ? 0 : LW_LOG_WARNING | LW_LOG_ERROR;
-    bool all_known = true;
-    self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
-    for (size_t i = 0; i < nCategories; i++) {
-        unsigned category = categories[i] ? lw_category_of(categories[i]) : 0;
-        chosen |= category;
-        if (category) continue;
-        all_known = false;
-        lw_warn(self, "fmi2SetDebugLogging: there is no log category %s, only logStatusWarning, logStatusError and logAll.",
-                categories[i] ? categories[i] : "NULL");
-    }
-    self->categories = loggingOn ? chosen : 0;
-    return all_known ? fmi2OK : fmi2Warning;
+    return lw_choose_categories(self, loggingOn, nCategories, categories) ? fmi2OK : fmi2Warning;
 }
 
 /* ---- life (FMI 2.0, 2.1.5 and 2.1.6) ---- */
 
-static bool lw_is_blank(const char *text) { return !text || text[strspn(text, " \t\r\n")] == 0; }
-
 fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2String fmuGUID, fmi2String fmuResourceLocation,
         const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean loggingOn) {
     (void)fmuResourceLocation, (void)visible;
-    const char *name = lw_is_blank(instanceName) ? LW_MODEL_NAME : instanceName;
-    lw_instance *self = lw_create(name, strlen(name));
+    lw_instance *self = lw_create_named(instanceName, fmuType == fmi2ModelExchange, loggingOn);
     if (!self) return NULL;
-    self->s.model_exchange = fmuType == fmi2ModelExchange;
-    self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
     if (functions && functions->logger) {
         self->environment = functions->componentEnvironment;
         self->write = lw_write_fmi2;
         self->sink = (void (*)(void))functions->logger;
     }
-    bool ok = true;
-    if (lw_is_blank(instanceName)) ok = lw_fail(self, "the instance name is empty. Give one.");
-    else if (!fmuGUID || strcmp(fmuGUID, LW_TOKEN))
-        ok = lw_fail(self, "the GUID is %s, expected " LW_TOKEN ". The modelDescription.xml that was read doesn't belong to "
-                     "this binary: unzip the FMU again.", fmuGUID ? fmuGUID : "missing");
-    else if (fmuType != fmi2CoSimulation && fmuType != fmi2ModelExchange)
+    bool ok = lw_check_instantiation(self, instanceName, fmuGUID);
+    if (ok && fmuType != fmi2CoSimulation && fmuType != fmi2ModelExchange)
         ok = lw_fail(self, "the type is %d, expected fmi2ModelExchange (0) or fmi2CoSimulation (1).", (int)fmuType);
-    else if (LW_LOOP && fmuType == fmi2ModelExchange)
-        ok = lw_fail(self, "this FMU is for Co-Simulation only. Instantiate it as fmi2CoSimulation.");
     if (ok) return self;
     lw_destroy(self);
     return NULL;
@@ -109,9 +79,7 @@ fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
 
 fmi2Status fmi2Terminate(fmi2Component c) {
     LW_SELF;
-    if (!lw_is_initialized(self, "fmi2Terminate")) return fmi2Error;
-    self->s.mode = LW_TERMINATED;
-    return fmi2OK;
+    return LW_OK(lw_terminate(self));
 }
 
 /* ---- variables (FMI 2.0, 2.1.7) ---- */
@@ -173,20 +141,6 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
 
 /* ---- stepping (FMI 2.0, 4.2.2) ---- */
 
-static inline bool lw_check_step(lw_instance *self, double t, double h) {
-    double now = self->s.values[0], tolerance = 1e-12 * fabs(now) + 1e-6 * fabs(h);
-    if (!lw_in_mode(self, "fmi2DoStep", LW_STEPPING)) return false;
-    if (!(isfinite(h) && h > 0))
-        return lw_fail(self, "fmi2DoStep: the communication step is %g s at t = %.9g s, expected a positive number.", h, now);
-    if (!(fabs(t - now) <= tolerance))
-        return lw_fail(self, "fmi2DoStep: currentCommunicationPoint is %.17g s, but this FMU is at %.17g s. Step from where "
-                       "the last step ended, or set an FMU state first.", t, now);
-    if (self->s.stop_time_defined && t + h > self->s.stop_time + tolerance)
-        return lw_fail(self, "fmi2DoStep: a step of %g s from t = %.9g s passes the stop time of %.9g s. Give a later stopTime "
-                       "to fmi2SetupExperiment, or none.", h, t, self->s.stop_time);
-    return true;
-}
-
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2Real communicationStepSize,
         fmi2Boolean noSetFMUStatePriorToCurrentPoint) {
     LW_SELF;
@@ -196,28 +150,6 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2R
 }
 
 /* ---- Model Exchange (FMI 2.0, 3.2.1 and 3.2.2) ---- */
-
-/* Is the call allowed, and is the number of values right? */
-static bool lw_check_vector(lw_instance *self, const char *function, bool reading, const void *values, size_t found, size_t expected) {
-    if (!self->s.model_exchange)
-        return lw_fail(self, "%s: this is a Co-Simulation instance. Instantiate it as fmi2ModelExchange.", function);
-    if (!(reading && lw_is_readable(self)) && !lw_is_initialized(self, function)) return false;
-    if (found == expected) return lw_has_lists(self, function, NULL, 0, values, found);
-    return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
-}
-
-/* Outside of the model's domain the importer may try a shorter step (FMI 2.0, 2.1.3), so the instance is not terminated. */
-static fmi2Status lw_evaluated(lw_instance *self, int32_t mode, bool ok) {
-    if (ok) return fmi2OK;
-    if (mode != LW_CONTINUOUS) return fmi2Error;
-    self->s.mode = mode;
-    return fmi2Discard;
-}
-
-static bool lw_copy(double *to, const double *from, size_t n) {
-    if (n) memcpy(to, from, n * sizeof(double));
-    return true;
-}
 
 fmi2Status fmi2EnterEventMode(fmi2Component c) {
     LW_SELF;
@@ -269,14 +201,14 @@ fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t nx
     LW_SELF;
     int32_t mode = self->s.mode;
     if (!lw_check_vector(self, "fmi2GetDerivatives", true, derivatives, nx, LW_N_X)) return fmi2Error;
-    return lw_evaluated(self, mode, lw_update_derivatives(self) && lw_copy(derivatives, self->s.values + LW_DX, nx));
+    return LW_EVALUATED(lw_update_derivatives(self) && lw_copy(derivatives, self->s.values + LW_DX, nx));
 }
 
 fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real eventIndicators[], size_t ni) {
     LW_SELF;
     int32_t mode = self->s.mode;
     if (!lw_check_vector(self, "fmi2GetEventIndicators", true, eventIndicators, ni, LW_N_Z)) return fmi2Error;
-    return lw_evaluated(self, mode, lw_update_indicators(self) && lw_copy(eventIndicators, self->s.values + LW_Z, ni));
+    return LW_EVALUATED(lw_update_indicators(self) && lw_copy(eventIndicators, self->s.values + LW_Z, ni));
 }
 
 fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal[], size_t nx) {
@@ -299,19 +231,14 @@ fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate FMUstate) {
 
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
     LW_SELF;
-    if (FMUstate) {
-        free(*FMUstate);
-        *FMUstate = NULL;
-    }
+    lw_free_state(FMUstate);
     return fmi2OK;
 }
 
 fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate FMUstate, size_t *size) {
     LW_SELF;
     (void)FMUstate;
-    if (!lw_has_room(self, "fmi2SerializedFMUstateSize", size)) return fmi2Error;
-    *size = LW_SERIALIZED;
-    return fmi2OK;
+    return LW_OK(lw_get_serialized_size(self, "fmi2SerializedFMUstateSize", size));
 }
 
 fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate FMUstate, fmi2Byte serializedState[], size_t size) {

@@ -3,12 +3,12 @@
 #include "fmi3Functions.h"
 
 #define LW_OK(call) ((call) ? fmi3OK : fmi3Error)
+#define LW_EVALUATED(call) ((call) ? fmi3OK : lw_may_try_again(self, mode) ? fmi3Discard : fmi3Error) /* `mode`: before it */
 #define LW_SELF lw_instance *self = instance; if (!self) return fmi3Error
 
 static void lw_write_fmi3(lw_instance *self, lw_category category, const char *message) {
     fmi3LogMessageCallback log = (fmi3LogMessageCallback)self->sink;
-    bool error = category == LW_LOG_ERROR;
-    log(self->environment, error ? fmi3Error : fmi3Warning, error ? "logStatusError" : "logStatusWarning", message);
+    log(self->environment, category == LW_LOG_ERROR ? fmi3Error : fmi3Warning, lw_category_name(category), message);
 }
 
 /* ---- versions and logging (FMI 3.0, 2.3.1) ---- */
@@ -17,46 +17,19 @@ const char *fmi3GetVersion(void) { return fmi3Version; }
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories, const fmi3String categories[]) {
     LW_SELF;
-    if (!categories) nCategories = 0;
-    unsigned chosen = nCategories ? 0 : LW_LOG_WARNING | LW_LOG_ERROR, known = LW_LOG_WARNING | LW_LOG_ERROR;
-    bool all_known = true;
-    for (size_t i = 0; i < nCategories; i++) {
-        if (!categories[i]) all_known = false;
-        else if (!strcmp(categories[i], "logStatusError")) chosen |= LW_LOG_ERROR;
-        else if (!strcmp(categories[i], "logStatusWarning")) chosen |= LW_LOG_WARNING;
-        else all_known = false;
-    }
-    self->categories = loggingOn ? known : 0;
-    for (size_t i = 0; i < nCategories && !all_known; i++)
-        if (!categories[i] || (strcmp(categories[i], "logStatusError") && strcmp(categories[i], "logStatusWarning")))
-            lw_warn(self, "fmi3SetDebugLogging: there is no log category %s, only logStatusWarning and logStatusError.",
-                    categories[i] ? categories[i] : "NULL");
-    self->categories = loggingOn ? chosen : 0;
-    return all_known ? fmi3OK : fmi3Warning;
+    return lw_choose_categories(self, loggingOn, nCategories, categories) ? fmi3OK : fmi3Warning;
 }
 
 /* ---- life (FMI 3.0, 2.3.1 to 2.3.3) ---- */
 
-static bool lw_is_blank(const char *text) { return !text || text[strspn(text, " \t\r\n")] == 0; }
-
 static lw_instance *lw_instantiate_fmi3(fmi3String instanceName, fmi3String instantiationToken, fmi3Boolean loggingOn,
         fmi3InstanceEnvironment instanceEnvironment, fmi3LogMessageCallback logMessage, bool model_exchange) {
-    const char *name = lw_is_blank(instanceName) ? LW_MODEL_NAME : instanceName;
-    lw_instance *self = lw_create(name, strlen(name));
+    lw_instance *self = lw_create_named(instanceName, model_exchange, loggingOn);
     if (!self) return NULL;
-    self->s.model_exchange = model_exchange;
-    self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
     self->environment = instanceEnvironment;
     self->write = logMessage ? lw_write_fmi3 : NULL;
     self->sink = (void (*)(void))logMessage;
-    bool ok = true;
-    if (lw_is_blank(instanceName)) ok = lw_fail(self, "the instance name is empty. Give one.");
-    else if (!instantiationToken || strcmp(instantiationToken, LW_TOKEN))
-        ok = lw_fail(self, "the instantiation token is %s, expected " LW_TOKEN ". The modelDescription.xml that was read "
-                     "doesn't belong to this binary: unzip the FMU again.", instantiationToken ? instantiationToken : "missing");
-    else if (LW_LOOP && model_exchange)
-        ok = lw_fail(self, "this FMU is for Co-Simulation only. Use fmi3InstantiateCoSimulation.");
-    if (ok) return self;
+    if (lw_check_instantiation(self, instanceName, instantiationToken)) return self;
     lw_destroy(self);
     return NULL;
 }
@@ -151,9 +124,7 @@ fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
 
 fmi3Status fmi3Terminate(fmi3Instance instance) {
     LW_SELF;
-    if (!lw_is_initialized(self, "fmi3Terminate")) return fmi3Error;
-    self->s.mode = LW_TERMINATED;
-    return fmi3OK;
+    return LW_OK(lw_terminate(self));
 }
 
 /* ---- variables (FMI 3.0, 2.2.6.2) ---- */
@@ -171,20 +142,6 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference valueR
 }
 
 /* ---- stepping (FMI 3.0, 4.2.1) ---- */
-
-static inline bool lw_check_step(lw_instance *self, double t, double h) {
-    double now = self->s.values[0], tolerance = 1e-12 * fabs(now) + 1e-6 * fabs(h);
-    if (!lw_in_mode(self, "fmi3DoStep", LW_STEPPING)) return false;
-    if (!(isfinite(h) && h > 0))
-        return lw_fail(self, "fmi3DoStep: the communication step is %g s at t = %.9g s, expected a positive number.", h, now);
-    if (!(fabs(t - now) <= tolerance))
-        return lw_fail(self, "fmi3DoStep: currentCommunicationPoint is %.17g s, but this FMU is at %.17g s. Step from where "
-                       "the last step ended, or set an FMU state first.", t, now);
-    if (self->s.stop_time_defined && t + h > self->s.stop_time + tolerance)
-        return lw_fail(self, "fmi3DoStep: a step of %g s from t = %.9g s passes the stop time of %.9g s. Give a later stopTime "
-                       "to fmi3EnterInitializationMode, or none.", h, t, self->s.stop_time);
-    return true;
-}
 
 fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoint, fmi3Float64 communicationStepSize,
         fmi3Boolean noSetFMUStatePriorToCurrentPoint, fmi3Boolean *eventHandlingNeeded, fmi3Boolean *terminateSimulation,
@@ -215,19 +172,14 @@ fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState FMUState) {
 
 fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
     LW_SELF;
-    if (FMUState) {
-        free(*FMUState);
-        *FMUState = NULL;
-    }
+    lw_free_state(FMUState);
     return fmi3OK;
 }
 
 fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState FMUState, size_t *size) {
     LW_SELF;
     (void)FMUState;
-    if (!lw_has_room(self, "fmi3SerializedFMUStateSize", size)) return fmi3Error;
-    *size = LW_SERIALIZED;
-    return fmi3OK;
+    return LW_OK(lw_get_serialized_size(self, "fmi3SerializedFMUStateSize", size));
 }
 
 fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState FMUState, fmi3Byte serializedState[], size_t size) {

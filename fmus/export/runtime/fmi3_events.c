@@ -141,32 +141,6 @@ fmi3Status fmi3GetShiftFraction(fmi3Instance instance, const fmi3ValueReference 
 
 /* ---- Model Exchange (FMI 3.0, 3.2) ---- */
 
-static bool lw_is_model_exchange(lw_instance *self, const char *function) {
-    if (self->s.model_exchange) return true;
-    return lw_fail(self, "%s: this is a Co-Simulation instance. Use fmi3InstantiateModelExchange.", function);
-}
-
-/* Is the call allowed, and is the number of values right? */
-static bool lw_check_vector(lw_instance *self, const char *function, bool reading, const void *values, size_t found, size_t expected) {
-    if (!lw_is_model_exchange(self, function)) return false;
-    if (!(reading && lw_is_readable(self)) && !lw_is_initialized(self, function)) return false;
-    if (found == expected) return lw_has_lists(self, function, NULL, 0, values, found);
-    return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
-}
-
-/* Outside of the model's domain the importer may try a shorter step (FMI 3.0, 2.2.3), so the instance is not terminated. */
-static fmi3Status lw_evaluated(lw_instance *self, int32_t mode, bool ok) {
-    if (ok) return fmi3OK;
-    if (mode != LW_CONTINUOUS) return fmi3Error;
-    self->s.mode = mode;
-    return fmi3Discard;
-}
-
-static bool lw_copy(double *to, const double *from, size_t n) {
-    if (n) memcpy(to, from, n * sizeof(double));
-    return true;
-}
-
 fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
     LW_SELF;
     const char *function = "fmi3EnterContinuousTimeMode";
@@ -204,14 +178,14 @@ fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 
     LW_SELF;
     int32_t mode = self->s.mode;
     if (!lw_check_vector(self, "fmi3GetContinuousStateDerivatives", true, derivatives, nContinuousStates, LW_N_X)) return fmi3Error;
-    return lw_evaluated(self, mode, lw_update_derivatives(self) && lw_copy(derivatives, self->s.values + LW_DX, LW_N_X));
+    return LW_EVALUATED(lw_update_derivatives(self) && lw_copy(derivatives, self->s.values + LW_DX, LW_N_X));
 }
 
 fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 eventIndicators[], size_t nEventIndicators) {
     LW_SELF;
     int32_t mode = self->s.mode;
     if (!lw_check_vector(self, "fmi3GetEventIndicators", true, eventIndicators, nEventIndicators, LW_N_Z)) return fmi3Error;
-    return lw_evaluated(self, mode, lw_update_indicators(self) && lw_copy(eventIndicators, self->s.values + LW_Z, LW_N_Z));
+    return LW_EVALUATED(lw_update_indicators(self) && lw_copy(eventIndicators, self->s.values + LW_Z, LW_N_Z));
 }
 
 fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[], size_t nContinuousStates) {

@@ -1,7 +1,7 @@
 /* Runtime of exported FMUs: declarations of a generated model, and of an instance.
  *
  * One translation unit per FMU: the generated model.c defines the LW_ constants below, includes this header, then holds
- * the equations and tables, then includes core.c, integrators.c, events.c and stepping.c (no FMI version in them) and the
+ * the equations and tables, then includes core.c, integrators.c, events.c and stepping.c (no FMI version in them), fmi_calls.c and the
  * files of one FMI version. linear.c, fixed_step.c and embedded.c, which these include, are those of runs of diagrams
  * (fmus/runtime). Being one unit, the equations are inlined into the integrator, and all sizes are constants.
  *
