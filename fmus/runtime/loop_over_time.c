@@ -3,6 +3,13 @@
 
    It goes as far as it can. Where it breaks off, `p.lost` says at which of its numbers, and Python says why. */
 
+/* The parts of a turn of the loop are inlined into it: calls take some percent of a tick. */
+#if defined(__GNUC__)
+#define PART_OF_TURN static inline __attribute__((always_inline))
+#else
+#define PART_OF_TURN static inline
+#endif
+
 /* Begin a stretch that ends at a discontinuity, or at the next tick. */
 static inline double begin_stretch(hybrid *h, progress *g, double end) {
     problem *p = &h->p;
@@ -28,112 +35,155 @@ static inline double begin_stretch(hybrid *h, progress *g, double end) {
 /* Whether the run ends at the instant that has been evaluated. */
 static inline bool is_at_end(const hybrid *h) { return is_stopped(&h->l) || (h->o && has_ended(h->o)); }
 
-/* Continue to the next tick that is landed on; DONE: it is reached. */
+/* Let the method take a step, and find the first event in it. DONE, or why it goes no further. */
+PART_OF_TURN int64_t take_a_step(hybrid *h, double end, int64_t *steps) {
+    problem *p = &h->p;
+    method *m = h->methods[h->active];
+    if ((*steps)++ > h->budget) return SUSPENDED;
+    if (p->delays && !has_room_for_step(p->delays)) return SUSPENDED;
+    if (h->o && h->o->apart && h->o->apart->late && *steps > 1) return SUSPENDED;
+    if (take_step(m) != PASSED) {
+        const bool other = h->automatic && m->kind != RADAU && p->lost == IN_STEP;
+        if (!other || (h->o && h->o->failed)) return break_off(h, h->t, LOST);
+        h->switched = STUCK;
+        h->begun = 0;
+        return LOOK;
+    }
+    if (h->automatic) look_for_stiffness(h, m);
+    h->to = m->t;
+    h->counts_as = INFINITY;
+    h->found = 0;
+    if (h->w.m && !h->w.sliding) {
+        const int where = locate(&h->w, p, m, &h->to);
+        if (where == LOST) return break_off(h, h->t, LOST);
+        h->found = where == EVENT;
+        if (h->found && p->loops)
+            for (int64_t i = 0; i < p->loops->n; i++) h->solved[i] = p->x[p->loops->where[i]];
+        if (h->found && m->t == end && end - h->to <= ULPS * ulp(end)) h->to = end;
+    }
+    h->stepped = 1;
+    return DONE;
+}
+
+/* Record the samples within the step, from its dense output, and up to its end where nothing happens there. */
+PART_OF_TURN int64_t sample_step(hybrid *h, progress *g) {
+    const span *s = g->s;
+    method *m = h->methods[h->active];
+    while (g->i < s->count && !s->lands[g->i]) {
+        const double t = s->times[g->i + 1];
+        if (!(t < h->to || (t == h->to && t < h->p.edge && !h->found))) break;
+        if (h->found && h->to - t <= ULPS * ulp(t)) { /* the event belongs to the sample, which is taken after it */
+            h->counts_as = t;
+            break;
+        }
+        if (!has_room(h, g)) return SUSPENDED;
+        interpolate(m, t, m->y);
+        stand_at(h, t, m->y);
+        if (!evaluate_here(h, h->between)) return break_off(h, t, LOST);
+        g->out->rows = record(&h->l, t, g->rows, g->out->rows);
+        g->i++;
+        if (is_stopped(&h->l)) {
+            h->t = t;
+            h->inside = 0;
+            return ENDED;
+        }
+    }
+    return DONE;
+}
+
+/* Put the states to the end of the step, or to the event in it; blocks take over what they remember, where they are asked. */
+PART_OF_TURN int64_t end_step(hybrid *h, double end) {
+    problem *p = &h->p;
+    method *m = h->methods[h->active];
+    if (p->delays && h->to > m->t_old && !keep_pieces(p->delays, p, m, m->t_old, h->to, DEEPEST))
+        return break_off(h, h->t, LOST);
+    if (h->found)
+        interpolate(m, h->to, m->y);
+    else
+        memcpy(m->y, m->x, (size_t)m->n * sizeof(double));
+    stand_at(h, h->to > p->left ? p->left : h->to, m->y);
+    if (h->accepts && (h->accepts == 1 || h->to < end || h->found) && !accept(h)) return break_off(h, h->to, LOST);
+    return DONE;
+}
+
+/* Tell the FMUs in model exchange that the step has ended, at t, and settle the events that they have there. */
+static inline int64_t end_step_of_fmus(hybrid *h, double t, double end, bool *happened) {
+    int result = report_step(h);
+    if (result == EVENT && !h->found) {
+        *happened = true;
+        result = settle(h, t, false);
+        if (result < LOST && has_ended(h->o) && !accept(h)) result = LOST;
+    }
+    if (result >= LOST) return break_off(h, t, result);
+    h->looked = t == end && !*happened && !h->l.plants && is_before(end, h->jump) ? end : NAN;
+    return DONE;
+}
+
+/* Let the events fire that were found at a time, and count as being at t. */
+PART_OF_TURN int64_t fire_found(hybrid *h, double t, double at) {
+    problem *p = &h->p;
+    if (p->loops) /* as the indicators saw them */
+        for (int64_t i = 0; i < p->loops->n; i++) h->l.x[p->loops->where[i]] = h->solved[i];
+    const int result = fire(h, t, at);
+    *h->l.t = t;
+    if (result >= LOST) return break_off(h, t, result);
+    look_for_sliding(&h->w);
+    return DONE;
+}
+
+/* Go beyond a discontinuity of a source at t, with the events that it makes. */
+static inline int64_t pass_discontinuity(hybrid *h, progress *g, double t, bool *happened) {
+    enter(h, g, t);
+    if (h->w.m || h->o) {
+        const int result = settle(h, t, false);
+        if (result >= LOST) return break_off(h, t, result);
+        *happened |= result == EVENT;
+    }
+    return evaluate_here(h, h->between) ? DONE : break_off(h, t, LOST);
+}
+
+/* Record the instant t that has been reached, if it is a sample, or the run ends there; DONE: it continues. */
+PART_OF_TURN int64_t sample_instant(hybrid *h, progress *g, double t, double end, bool happened) {
+    const span *s = g->s;
+    const bool is_sample = g->i < s->count && !s->lands[g->i] && s->times[g->i + 1] == t && t < end;
+    if (!is_sample && !(happened && is_at_end(h))) return DONE;
+    g->out->rows = record(&h->l, t, g->rows, g->out->rows);
+    g->i += is_sample;
+    if (!is_at_end(h)) return DONE;
+    h->inside = 0;
+    return ENDED;
+}
+
+/* Continue to the next tick that is landed on; DONE: it is reached. Each turn is one step of the method: it ends at an event,
+   at a discontinuity, at the tick, or where the method has come to. Whoever breaks it off may call it again: `begun` and
+   `stepped` say what has been done. */
 static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
     const span *s = g->s;
     problem *p = &h->p;
     const int64_t landing = landing_of(g);
     const double end = landing < s->count ? s->times[landing + 1] : s->beyond;
+    int64_t reason;
     while (h->t < end) {
         if (!h->begun) begin_stretch(h, g, end);
         const double edge = p->edge;
         method *m = h->methods[h->active];
-        if (!h->stepped) {
-            if ((*steps)++ > h->budget) return SUSPENDED;
-            if (p->delays && !has_room_for_step(p->delays)) return SUSPENDED;
-            if (h->o && h->o->apart && h->o->apart->late && *steps > 1) return SUSPENDED;
-            if (take_step(m) != PASSED) {
-                const bool other = h->automatic && m->kind != RADAU && p->lost == IN_STEP;
-                if (!other || (h->o && h->o->failed)) return break_off(h, h->t, LOST);
-                h->switched = STUCK;
-                h->begun = 0;
-                return LOOK;
-            }
-            if (h->automatic) look_for_stiffness(h, m);
-            h->to = m->t;
-            h->counts_as = INFINITY;
-            h->found = 0;
-            if (h->w.m && !h->w.sliding) {
-                const int where = locate(&h->w, p, m, &h->to);
-                if (where == LOST) return break_off(h, h->t, LOST);
-                h->found = where == EVENT;
-                if (h->found && p->loops)
-                    for (int64_t i = 0; i < p->loops->n; i++) h->solved[i] = p->x[p->loops->where[i]];
-                if (h->found && m->t == end && end - h->to <= ULPS * ulp(end)) h->to = end;
-            }
-            h->stepped = 1;
-        }
-        while (g->i < s->count && !s->lands[g->i]) {
-            const double t = s->times[g->i + 1];
-            if (!(t < h->to || (t == h->to && t < edge && !h->found))) break;
-            if (h->found && h->to - t <= ULPS * ulp(t)) { /* the event belongs to the sample, which is taken after it */
-                h->counts_as = t;
-                break;
-            }
-            if (!has_room(h, g)) return SUSPENDED;
-            interpolate(m, t, m->y);
-            stand_at(h, t, m->y);
-            if (!evaluate_here(h, h->between)) return break_off(h, t, LOST);
-            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
-            g->i++;
-            if (is_stopped(&h->l)) {
-                h->t = t;
-                h->inside = 0;
-                return ENDED;
-            }
-        }
+        if (!h->stepped && (reason = take_a_step(h, end, steps)) != DONE) return reason;
+        if ((reason = sample_step(h, g)) != DONE) return reason;
         if (g->i == s->count && landing == s->count) return SUSPENDED;
         if (!has_room(h, g)) return SUSPENDED; /* the instant itself may be a sample */
-        if (p->delays && h->to > m->t_old && !keep_pieces(p->delays, p, m, m->t_old, h->to, DEEPEST))
-            return break_off(h, h->t, LOST);
-        if (h->found)
-            interpolate(m, h->to, m->y);
-        else
-            memcpy(m->y, m->x, (size_t)m->n * sizeof(double));
-        stand_at(h, h->to > p->left ? p->left : h->to, m->y);
-        if (h->accepts && (h->accepts == 1 || h->to < end || h->found) && !accept(h)) return break_off(h, h->to, LOST);
+        if ((reason = end_step(h, end)) != DONE) return reason;
+        /* What happens at the instant: FMUs and events first, then a discontinuity of a source. */
         const double at = h->to, t = h->found && h->counts_as < at ? h->counts_as : at;
         bool happened = h->found;
-        if (h->o) {
-            int result = report_step(h);
-            if (result == EVENT && !h->found) {
-                happened = true;
-                result = settle(h, t, false);
-                if (result < LOST && has_ended(h->o) && !accept(h)) result = LOST;
-            }
-            if (result >= LOST) return break_off(h, t, result);
-            h->looked = t == end && !happened && !h->l.plants && is_before(end, h->jump) ? end : NAN;
-        }
+        if (h->o && (reason = end_step_of_fmus(h, t, end, &happened)) != DONE) return reason;
         h->stepped = 0;
-        if (h->found && p->loops) /* as the indicators saw them */
-            for (int64_t i = 0; i < p->loops->n; i++) h->l.x[p->loops->where[i]] = h->solved[i];
-        if (h->found) {
-            const int result = fire(h, t, at);
-            *h->l.t = t;
-            if (result >= LOST) return break_off(h, t, result);
-            look_for_sliding(&h->w);
-        }
+        if (h->found && (reason = fire_found(h, t, at)) != DONE) return reason;
         h->t = t;
         if (t == edge && p->delays) note_reached(p->delays, t, !is_before(t, h->jump));
-        if (t == edge && edge < end) { /* a discontinuity of a source */
-            enter(h, g, t);
-            if (h->w.m || h->o) {
-                const int result = settle(h, t, false);
-                if (result >= LOST) return break_off(h, t, result);
-                happened |= result == EVENT;
-            }
-            if (!evaluate_here(h, h->between)) return break_off(h, t, LOST);
-        }
+        if (t == edge && edge < end && (reason = pass_discontinuity(h, g, t, &happened)) != DONE) return reason;
         if (t == edge || happened) h->begun = 0;
         if (!h->begun && (happened || t < end)) m->has_slope = 0;
-        if (g->i < s->count && !s->lands[g->i] && s->times[g->i + 1] == t && t < end) {
-            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
-            g->i++;
-            if (is_at_end(h)) return h->inside = 0, ENDED;
-        } else if (happened && is_at_end(h)) {
-            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
-            return h->inside = 0, ENDED;
-        }
+        if ((reason = sample_instant(h, g, t, end, happened)) != DONE) return reason;
         if (h->switched) return LOOK;
         if (h->o && has_other_nominals(h->o)) return SUSPENDED;
     }
