@@ -14,7 +14,7 @@ from .diagram_code import (
 )
 from .event_domains import Domains
 from .events_in_c import Fired, Pile
-from .expanded_functions import LARGEST
+from .expanded_functions import LARGEST, ExpandedFunctions
 from .exported_memory import NamedCode, function_text, read_memory
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
@@ -48,6 +48,7 @@ __all__ = [
     "Delays",
     "DiagramCode",
     "Domains",
+    "ExpandedFunctions",
     "Fired",
     "FusedPlant",
     "Kernel",

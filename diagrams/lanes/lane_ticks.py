@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
-from typing import Any
 
-from ..compiled import LARGEST
-from ..flat import FlatDiagram, TickPattern, share_terms
+from ..compiled import LARGEST, ExpandedFunctions
+from ..flat import FlatDiagram, TickPattern
 from .grouped_code import GroupedCode
 from .scalar_calls import ScalarFunctions
 from .vector_code import VectorCode, write_vectors
@@ -23,10 +22,11 @@ class TickSources:
 
     def __init__(self, flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], scalars: ScalarFunctions):
         kinds = [*dict.fromkeys(acting)]
-        straight = None if flat.by_block else _find_straight(flat, kinds)
-        self.is_grouped, self.text = straight is None, ""
-        self._straight: Mapping[frozenset[TickPattern], Any] = straight or {}
-        if straight is None:
+        expanded = None if flat.by_block else ExpandedFunctions(flat, kinds)
+        self.is_grouped, self.text = True, ""
+        if expanded is not None and expanded.exact and expanded.operations <= LARGEST:
+            self.is_grouped, self._expanded = False, dict(zip(kinds, expanded.functions, strict=True))
+        else:
             self._programs = {clocks: flat.program_at(clocks) for clocks in kinds}
             self._code = GroupedCode([*self._programs.values()], scalars, read_source("grouped_lanes.c"))
             self.text = self._code.text
@@ -35,21 +35,9 @@ class TickSources:
         """Write the tick at which some clocks act, under a name."""
         if self.is_grouped:
             return self._code.write(name, self._programs[clocks])
-        return write_vectors(name, self._straight[clocks], _TICK, {3})
+        return write_vectors(name, self._expanded[clocks], _TICK, {3})
 
 
 def read_source(name: str) -> str:
     """Return a C source of this package."""
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
-
-
-def _find_straight(
-    flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]]
-) -> dict[frozenset[TickPattern], Any] | None:
-    """Return ticks as functions of scalar operations; None if they are none, or too many to be compiled as a whole."""
-    ticks = {clocks: flat.at_tick(clocks).last.fast for clocks in kinds}
-    if not all(tick.is_a("SXFunction") for tick in ticks.values()):
-        return None
-    if sum(tick.n_instructions() for tick in ticks.values()) > LARGEST:
-        return None
-    return {clocks: share_terms(tick) for clocks, tick in ticks.items()}

@@ -6,6 +6,8 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Function, Gain, SimulationError, Sine, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.compiled import write_code
+from loopwright.diagrams.flat import kinds_of
 from support.both_forms import assert_same_bits, both
 
 QUIET = {"progress": False}
@@ -59,6 +61,8 @@ def test_loops_of_several_values_satisfy_their_equations(n):
     assert np.max(np.abs(left + 0.1 * np.sin(left) + np.outer(u, b) - v)) < 1e-12
     assert_same_bits(interpreted, compiled)
     assert not compiled.messages
+    flat = made.flatten()
+    assert write_code(flat, kinds_of(flat, every=False)).exact  # so that compile="auto" changes over, too
 
 
 def test_a_loop_at_one_of_several_rates_is_solved_where_it_acts():
