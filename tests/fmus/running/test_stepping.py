@@ -84,6 +84,16 @@ def test_periodic_clocks_tick_at_their_times_whatever_the_step(clocked):
         assert run["plant.beats"].tolist() == [1.0, *[np.floor((t - 1e-9) / 0.15) + 1.0 for t in run.t[1:]]]
 
 
+def test_a_linearized_step_has_the_events_of_a_run(clocked):
+    """A step of 0.3 s from t = 0: the clock ticks at 0 and at 0.15 s, the time event is at 0.25 s, and x = 0.3 u."""
+    model = Fmu(clocked, name="plant").step_difference(0.3, inputs={"u": 1.0})
+    y = dict(zip(model.outputs, model.y0, strict=True))
+    assert (y["beats"], y["timed"]) == (2.0, 1.0)
+    assert y["x"] == pytest.approx(0.3, abs=1e-12)
+    row, column = model.outputs.index("x"), model.inputs.index("u")
+    assert model.D[row, column] == pytest.approx(0.3, abs=1e-9)
+
+
 @pytest.mark.parametrize(("step", "every"), [(0.1, 1e-12), (1e-7, 1e-12), (0.1, 2e-5), (1e-3, 1e-5)])
 @pytest.mark.drawn(2)
 def test_a_clock_that_ticks_very_often_is_told_with_its_rate(folder, step, every):
