@@ -158,6 +158,21 @@ def test_the_search_for_circles_finds_one():
     assert circle({"a": {"b", "c"}, "b": {"c"}}) == []
 
 
+def test_no_constant_of_a_file_is_given_twice():
+    """Functions read the last value, also those above it: two files that were joined had their own constants."""
+    wrong = []
+    for path in SOURCES:
+        (module,) = find_nodes(path, ast.Module)
+        statements = (node for node in module.body if isinstance(node, ast.Assign))
+        names = [name.id for node in statements for part in node.targets for name in ast.walk(part) if is_stored(name)]
+        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in sorted(set(names)) if names.count(name) > 1]
+    assert not wrong, "\n".join(wrong)
+
+
+def is_stored(node):
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+
+
 def test_neighbours_import_from_the_sub_package_and_nothing_private():
     wrong = []
     for path, line, target, name in imports():

@@ -9,7 +9,8 @@ from .coupled_parts import ContactParts
 from .environment import check_properties, check_property
 from .held_signals import StateMatrices
 from .measured_force import Tool
-from .passivity import LOWEST, Passivity, PassivityReason, PortPassivity
+from .passivity import LOWEST, Passivity
+from .port_passivity import PassivityReason, PortPassivity
 from .stability_limits import (
     PER_DECADE,
     ContactLimit,

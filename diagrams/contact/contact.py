@@ -24,17 +24,8 @@ from .environment import (
     points_in_a_decade,
     read_row,
 )
-from .passivity import (
-    CONTINUOUS,
-    HIGHEST,
-    LOWEST,
-    OFF_PATH,
-    PERIODIC,
-    SAMPLED,
-    Passivity,
-    find_negative,
-    find_passivity,
-)
+from .passivity import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, PERIODIC, SAMPLED, Passivity, find_negative
+from .port_passivity import find_passivity
 from .stability_limits import PER_DECADE, ContactLimit, ContactMap, find_limit, map_growth, read_scan
 from .touched_plant import TouchedPlant
 

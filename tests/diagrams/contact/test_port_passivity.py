@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Constant, Gain
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.contact.passivity import PassivityReason, find_zeros_of_real_part
-from support.haptic import DRAG, HANDLE, Handle, T, haptic
+from loopwright.diagrams.contact.port_passivity import PassivityReason, find_zeros_of_real_part
+from support.haptic import DRAG, HANDLE, MASS, Handle, T, haptic
 
 
 def colgate(stiffness, damping, delay):
@@ -65,6 +65,9 @@ def test_a_continuous_contact_is_passive_as_long_as_its_damping_is(gain):
     made = Diagram("handle", handle(motor=drive, push=hand))
     found = made.contact("handle.push", direction=[1.0], **HANDLE).passivity().port
     assert found.passive is (gain > -1.0)
+    if gain > -1.0:  # the margin is Re Y, and as near to 0 as 1e-9 of |Y| counts as 0
+        Y = 1.0 / (1j * found.frequency * MASS + DRAG * (1.0 + gain))
+        assert (found.margin, found.tolerance) == pytest.approx((Y.real, 1e-9 * abs(Y)), rel=1e-6)
 
 
 def test_zeros_of_the_real_part_are_those_of_its_polynomial():
