@@ -12,7 +12,7 @@ import threading
 import time
 import warnings
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from types import FrameType
@@ -22,20 +22,17 @@ import numpy as np
 
 from ...blocks.core import (
     Block,
-    LoopwrightError,
     OptionError,
     Sheet,
     ShownAsTable,
     SimulationError,
-    UnknownNameError,
     brief,
     count_of,
     explain_calls,
-    shorten,
 )
-from ..flat import FlatDiagram, Target, WiredDiagram
+from ..flat import FlatDiagram, WiredDiagram
 from ..results import Run, Stopped
-from ..wiring import Structure, change_parameter, find_control, join
+from .controls import Controls
 from .run_options import ticks_in
 from .view import SimulationView
 
@@ -94,95 +91,6 @@ class Pace:
     catch_up: float = 0.25  # seconds of the clock that are caught up after a delay; of a longer one all are given up
     clock: Callable[[], float] = time.perf_counter
     sleep: Callable[[float], object] = time.sleep
-
-
-@dataclass(frozen=True)
-class _Control:
-    """A parameter that is moved by hand: the name it was given by, its block, its place in that, and its source."""
-
-    name: str
-    path: str
-    keys: list[str]
-    source: Any
-
-    def read(self, t: float) -> object:
-        if hasattr(self.source, "value"):
-            return self.source.value
-        if not callable(self.source):
-            return self.source
-        try:
-            return self.source(t)
-        except Exception as error:
-            raise SimulationError(
-                f"the function given for {self.name!r} failed: {type(error).__name__}: {error}. Expected a number for "
-                "this time.",
-                block=self.path,
-                port=self.keys[-1],
-                t=t,
-            ) from error
-
-
-class Controls:
-    """Parameters that are moved by hand in a run."""
-
-    def __init__(self, table: Structure, inputs: Mapping[str, Any], diagram: str):
-        # Each input is a function of the time in s, an object with a ``value`` (a slider), or a number.
-        self._blocks: dict[str, Block] = {}
-        self._last: dict[str, object] = {}
-        self._controls: list[_Control] = []
-        for name, source in inputs.items():
-            if isinstance(source, str | bytes) or source is None:
-                raise OptionError(
-                    f"found {shorten(source)} for {name!r}; expected a function of the time, a slider or a number.",
-                    block=diagram,
-                    port="inputs",
-                )
-            path, keys = find_control(table, name, diagram)
-            if not table.is_traced(path):
-                whole = join(path, ".".join(keys))
-                raise UnknownNameError(
-                    f"{name!r} is of {path}, {type(table.blocks[path]).__name__}, which takes no parameters in a run; "
-                    "expected a parameter of a block that the run evaluates. Set it before the run: "
-                    f"diagram.replace({{{whole!r}: …}}).",
-                    block=diagram,
-                    port="inputs",
-                )
-            self._blocks[path] = table.blocks[path]
-            self._controls.append(_Control(name, path, keys, source))
-
-    @property
-    def targets(self) -> list[Target]:
-        """The parameters: path of a block, and the names that lead to one in it."""
-        return [(control.path, control.keys) for control in self._controls]
-
-    def move(self, simulation: Advancing, changes: list[tuple[float, str, object]]) -> None:
-        """Give a run the values of this instant, those that have changed, and note them."""
-        t, moved = simulation.t, dict[str, Block]()
-        for control in self._controls:
-            value = control.read(t)
-            if control.name in self._last and np.array_equal(self._last[control.name], value):  # type: ignore[arg-type]
-                continue
-            self._last[control.name] = value
-            try:
-                block = change_parameter(self._blocks[control.path], control.keys, value)
-            except LoopwrightError as error:
-                raise _explain_value(error.at(block=control.path), control, t) from None
-            self._blocks[control.path] = moved[control.path] = block
-            changes.append((t, f"{control.path}.{'.'.join(control.keys)}", value))
-        for path, block in moved.items():
-            simulation.set_parameters(path, block)
-
-
-def _explain_value(error: LoopwrightError, control: _Control, t: float) -> LoopwrightError:
-    """Return the error of a value that a function or a slider has given: it says when."""
-    if not (callable(control.source) or hasattr(control.source, "value")):
-        return error
-    return SimulationError(
-        f"what is given for {control.name!r} can't be taken: {error.message}",
-        block=error.block,
-        port=error.port,
-        t=t,
-    )
 
 
 @explain_calls
@@ -431,7 +339,10 @@ class LiveRun(ShownAsTable):
                 self._worst = max(self._worst, late)
                 ticks = in_a_frame if left is None else min(in_a_frame, left)
                 span = ticks * base if ticks else rest
-                controls.move(simulation, self.changes)
+                changes, blocks = controls.read(simulation.t)
+                self.changes += changes
+                for path, block in blocks.items():
+                    simulation.set_parameters(path, block)
                 moved = pace.clock()
                 simulation.advance(span)
                 self.t, computed = simulation.t, pace.clock()

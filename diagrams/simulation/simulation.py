@@ -29,9 +29,10 @@ from ..results import (
     check_fits,
     not_open_error,
 )
+from .controls import Controls
 from .engine import Engine
 from .held_inputs import note_held_inputs
-from .live_run import FRAME, Controls, LiveRun, Pace
+from .live_run import FRAME, LiveRun, Pace
 from .progress import Interrupted, ProgressOption, compiler_notes, progress_bar
 from .run_options import RunOptions, default_step, refuse_rest, ticks_in
 from .save import can_save, restore_state, save_state
