@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...blocks.called_back import CalledBack
 from ...blocks.core import SimulationError
-from ...blocks.interrupts import INTERRUPTS
-from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
-from ...fmus.host_state import HostState
+from ...fmus.calls import NEAR, FmuInstance
 from ..flat import TRUE, StepTable, TickPattern
 from .bound_functions import CALL, TICK, MemoryForC, TickStructure, at
 from .diagram_code import DiagramCode
 from .model_exchange_in_c import NativeModelExchange
 from .newton import NewtonOptions, NewtonStructure
-from .plants_called_back import PythonStep, RemotePlants
+from .plants_called_back import PythonStep
+from .plants_of_loop import LoopPlants
 from .rate_differences import SlopesByDifferences
 from .runtime import load_runtime
 
@@ -44,30 +41,6 @@ class OutcomeStructure(ctypes.Structure):
     def read(self, t: float = np.nan) -> Outcome:
         """Return it, with the time that continuous states have reached."""
         return Outcome(self.ticks, self.rows, ReturnReason(self.reason), self.plant, self.stage, self.status, t)
-
-
-class _Transfer(ctypes.Structure):
-    _fields_ = [
-        ("function", ctypes.c_void_p),
-        ("references", ctypes.c_void_p),
-        ("count", ctypes.c_size_t),
-        ("values", ctypes.c_void_p),
-        ("size", ctypes.c_size_t),
-    ]
-
-
-class _Plant(ctypes.Structure):
-    _fields_ = [
-        ("version", ctypes.c_int32),
-        ("instance", ctypes.c_void_p),
-        ("step", ctypes.c_void_p),
-        ("inputs", _Transfer),
-        ("outputs", _Transfer),
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("now", "width", "final", "flags", "reached", "changed", "far", "by_python", "quiet")
-        ),
-    ]
 
 
 class LoopStructure(ctypes.Structure):
@@ -152,12 +125,11 @@ class CompiledLoop:
         rest: Callable[[], int] | None = None,
     ):
         self.called = CalledBack()
-        self._remote, self._far = RemotePlants(), list[int | None]()
-        self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
+        self.plants = LoopPlants(plants, exchange)
+        """The plants, as C steps them."""
         self._memory = memory = MemoryForC(code, arguments, results, plants, columns, exchange)
         self._bind_block = None if exchange is None else exchange.bind_block
         self.calls_python = code.calls_python
-        self._watched: list[tuple[HostState, ctypes.c_bool]] = [] if exchange is None else [*exchange.watched]
         t, x, _, _ = arguments
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
@@ -173,7 +145,7 @@ class CompiledLoop:
             stops=len(stops),
             every=every,
             ticks=memory.array(ticks),
-            fmus=memory.array([self._plant(j, plant) for j, plant in enumerate(plants)]),
+            fmus=self.plants.address,
             t=at(t),
             x=at(x),
             x_next=at(x_next),
@@ -184,7 +156,7 @@ class CompiledLoop:
             truth=TRUE,
             near=NEAR,
         )
-        self.structure.apart = self._remote.address
+        self.structure.apart = self.plants.remote.address
         # One array where plants take their inputs as they are; then C copies nothing.
         if held is not None and held[0] is not held[1]:
             self.structure.z, self.structure.held = map(memory.own, held)
@@ -206,7 +178,7 @@ class CompiledLoop:
     @property
     def kept(self) -> list[Any]:
         """All that lives as long as the loop: whatever its pointers lead to."""
-        return self._memory.kept
+        return [*self._memory.kept, *self.plants.kept]
 
     def bind_loops(
         self,
@@ -251,93 +223,15 @@ class CompiledLoop:
         memory.kept.append(found)
         return found
 
-    def _plant(self, place: int, plant: FmuInstance | PythonStep) -> ctypes.Structure:
-        self._far.append(None)
-        if not isinstance(plant, FmuInstance):
-            return _Plant(by_python=self._remote.add_python(place, plant, None))
-        step, take = plant.native or plant.remote, partial(_take_step, plant)
-        if step is None:
-            return _Plant(by_python=self._remote.add_python(place, take, None))
-        self._memory.kept.append(step)
-        if isinstance(step, RemoteStep):
-            far = self._far[-1] = self._remote.add(step)
-            return _Plant(
-                now=step.now,
-                width=step.width,
-                flags=step.flags,
-                reached=step.reached,
-                far=far,
-                quiet=None if step.quiet is None else self._remote.add_quiet(step.quiet),
-                by_python=self._remote.add_python(place, take, far) if step.is_careful else None,
-            )
-        return self._native(step)
-
-    def begun(self) -> list[bool]:
-        """Return for each FMU whether C has begun a step in another process whose end Python has to see to."""
-        return [far is not None and self._remote.has_begun(far) for far in self._far]
-
     def check(self) -> None:
         """Raise the error of a function that C has called; to be asked once what a call has recorded is taken."""
         self.called.check()
-
-    def check_steps(self) -> None:
-        """Raise the error of a step that Python has taken for the loop."""
-        if self._remote.by_python is not None:
-            self._remote.by_python.check()
-
-    def _native(self, step: NativeStep) -> ctypes.Structure:
-        inputs, outputs = (
-            _Transfer()
-            if call is None
-            else _Transfer(call.function, call.references, call.count, call.values, call.size)
-            for call in (step.inputs, step.outputs)
-        )
-        changed = None
-        if step.host is not None:
-            self._watched.append((step.host, ctypes.c_bool()))
-            changed = ctypes.addressof(self._watched[-1][1])
-        return _Plant(
-            step.version,
-            step.instance,
-            step.step,
-            inputs,
-            outputs,
-            step.now,
-            step.width,
-            step.final,
-            step.flags,
-            step.reached,
-            changed,
-        )
 
     def set_steps(self, steps: StepTable | None) -> None:
         """Take the steps to the ticks of the next call; None where all plants step at each of them."""
         if steps is not None:
             self._table = [steps.begins, steps.widths, steps.holds]
             self._own.begins, self._own.widths, self._own.holds = map(at, self._table)
-
-    def guard(self) -> AbstractContextManager[None]:
-        """Leave this process's state as it was, whatever FMUs of others do to it meanwhile, and tell it.
-
-        C sets rounding mode and traps back after each step; the working folder is set back at the end.
-        """
-        if self._watched or any(r.address for r in self._remotes):
-            return self._guard()
-        return INTERRUPTS.kept() if self.calls_python else nullcontext()
-
-    @contextmanager
-    def _guard(self) -> Iterator[None]:
-        with ExitStack() as stack:
-            for host, _ in self._watched:
-                stack.enter_context(host)
-            for remote in self._remotes:
-                stack.enter_context(remote.guard())
-            if self.calls_python or any(r.address for r in self._remotes):
-                stack.enter_context(INTERRUPTS.kept())
-            yield
-        for host, changed in self._watched:
-            if changed:
-                host.note_modes()
 
     @property
     def skip(self) -> int:
@@ -372,7 +266,7 @@ class CompiledLoop:
             Steps of the plants that end at each of them, where not all plants step at all.
         """
         self.set_steps(steps)
-        with self.guard():
+        with self.plants.guard(calls_python=self.calls_python):
             self._run(
                 ctypes.addressof(self.structure),
                 len(widths),
@@ -383,8 +277,3 @@ class CompiledLoop:
                 ctypes.addressof(self._outcome),
             )
         return self._outcome.read()
-
-
-def _take_step(plant: FmuInstance, t: float, h: float) -> bool:
-    plant.step(t, h)
-    return plant.ends_run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -194,7 +195,6 @@ class CompiledHybrid:
             library[f"loopwright_{name}"] for name in ("go", "go_between", "note_beyond")
         )
         self._run.restype = self._run_between.restype = self._note_beyond.restype = None
-        self._guard = loop.guard
         structures = (hybrid, *(method.structure for method in self.methods))
         self._fresh = [(structure, bytes(structure)) for structure in structures]
 
@@ -209,6 +209,9 @@ class CompiledHybrid:
         events = [] if self.watch is None else self.watch.kept
         methods = [part for method in self.methods for part in (method.structure, method.kept)]
         return [*self.ticks.kept, *self._memory.kept, *self._equation.kept, *events, *methods]
+
+    def _guard(self) -> AbstractContextManager[None]:
+        return self.ticks.plants.guard(calls_python=self.ticks.calls_python)
 
     def note_taken(self, states: np.ndarray) -> None:
         """Note which states the tick renews that Python has just evaluated for C; see `CompiledLoop`."""

@@ -105,10 +105,10 @@ class PlantsInC:
             self.go(k, following, last)
             return
         if self._coupled is not None:
-            loop.check_steps()
+            loop.plants.check_steps()
             return
         due, rest = self.steps.due(k, following, last=following == last), list[Callable[[], None]]()
-        places = enumerate(zip(self._plants.items(), loop.begun(), strict=True))
+        places = enumerate(zip(self._plants.items(), loop.plants.begun(), strict=True))
         for place, ((path, plant), begun) in places:
             if place < found.plant or path not in due:
                 continue
@@ -118,7 +118,7 @@ class PlantsInC:
             elif place > found.plant:
                 rest.append(partial(plant.step, *due[path]))
             elif found.stage == TAKEN_BY_PYTHON:
-                rest.append(loop.check_steps)
+                rest.append(loop.plants.check_steps)
             else:
                 assert found.stage != UNDER_WAY
                 assert isinstance(plant, FmuInstance)
