@@ -24,15 +24,13 @@ from ..requirements import (
 from ..studies import is_zero, words_of
 from ..wiring import join
 from .case import Case
-from .sections.injection import REFUTED
+from .sections.injection import is_refuted
 from .sections.step_responses import unit_at
 from .sections.step_runs import APART, key_of_step
 from .stability import Stability, why_unstable
 from .variant import Cut, Variant
 
 STABLE = Limit(-math.inf, 0.0)
-MANY = 10.0
-"""Multiple of a measurement's uncertainty by which it has to be off to refute a linear model."""
 LEAST_POLE = 1e-9
 """Size of a pole, relative to the largest, below which it sets no frequency."""
 ALIKE = 1e-3
@@ -212,7 +210,7 @@ class VariantReview:
         start = f"injection.{key}.{self.v.key}"
         found = [self.numbers.get(f"{start}.{name}") for name in ("deviation", "uncertainty")]
         worst, own = (math.nan if number is None else number.value for number in found)
-        return worst - MANY * own > REFUTED
+        return is_refuted(worst, own)
 
     def _compare_other_cuts(self, result: RequirementResult) -> RequirementResult:
         """Return a result that is open where other cuts of its wire have other verdicts, and the plant may be there."""
