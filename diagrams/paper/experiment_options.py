@@ -6,14 +6,13 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from fractions import Fraction
-from numbers import Real
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from ...blocks import Ellipse, OptionError, Path
-from ...blocks.core import FINEST, SampleTimeError, near
+from ...blocks.core import FINEST, Kind, SampleTimeError, check_argument, kinds, near
 from ..wiring import exact_time
 
 ELLIPSE = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
@@ -47,20 +46,42 @@ limits None (or infinity) is no limit. ``sample_time``: s, a number or a `Fracti
 duration. ``admittance_method``: ``exact`` or ``semi_implicit``.
 """
 
-_NOT_NEGATIVE = ("a number that is not negative", lambda value: is_number(value) and value >= 0, float)
-KINDS: Mapping[str, tuple[str, Callable[[Any], bool], Callable[[Any], Any]]] = {
-    "friction_width": ("a positive number", lambda value: is_number(value) and value > 0, float),
-    **dict.fromkeys(("coulomb_scale", "viscous_scale", "tool_mass", "encoder"), _NOT_NEGATIVE),
-    "delay": ("0 or 1 samples", lambda value: is_number(value) and value in (0, 1), int),
-    "admittance_method": (
-        "'exact' or 'semi_implicit'",
-        lambda value: isinstance(value, str) and value in ("exact", "semi_implicit"),
-        str,
-    ),
-    "path": ("a path, such as Ellipse(…)", lambda value: isinstance(value, Path), lambda value: value),
-}
-"""Options that are conditions on one value: what is expected, whether a value is that, and the form it takes."""
+_POSITIVE = kinds.positive.worded(found=kinds.as_written)
+_NOT_NEGATIVE = kinds.finite.where(lambda value: value >= 0).worded(
+    "a number that is not negative", found=kinds.as_written
+)
+_FLAG = kinds.flag.worded(found=kinds.as_written)
+
+
+def _is_limit(value: Any) -> bool:
+    """Whether a value is a limit: None or infinity for none, a positive number, or one or two of these in a list."""
+    entries = np.array(value, dtype=object)
+    some = entries.ndim == 0 or entries.shape in ((1,), (2,))
+    return some and all(v is None or v == math.inf or _POSITIVE.holds(v) for v in np.ravel(entries))
+
+
+def _to_limit(value: Any) -> float | tuple[float | None, ...] | None:
+    """Return a limit as None, a number, or a pair whose entries are None where there is no limit."""
+    entries = [None if v is None or v == math.inf else float(v) for v in np.ravel(np.array(value, dtype=object))]
+    if np.ndim(np.array(value, dtype=object)) == 0:
+        return entries[0]
+    pair = tuple(entries) * (2 // len(entries))
+    return None if pair == (None, None) else pair
+
+
 LIMITS = ("motor_force_limit", "velocity_limit", "acceleration_limit")
+_LIMIT = Kind(
+    "a positive number, a pair of them, or None (in a pair, too, None is no limit)", _is_limit, found=kinds.as_written
+)
+KINDS: Mapping[str, tuple[Kind, Callable[[Any], Any]]] = {
+    "friction_width": (_POSITIVE, float),
+    **dict.fromkeys(("coulomb_scale", "viscous_scale", "tool_mass", "encoder"), (_NOT_NEGATIVE, float)),
+    "delay": (kinds.finite.where(lambda value: value in (0, 1)).worded("0 or 1 samples", found=kinds.as_written), int),
+    "admittance_method": (kinds.choice("exact", "semi_implicit").worded(found=kinds.as_written), str),
+    "path": (kinds.one_of_class(Path, "a path, such as Ellipse(…)").worded(found=kinds.as_written), lambda path: path),
+    **dict.fromkeys(LIMITS, (_LIMIT, _to_limit)),
+}
+"""Kinds of the options that are conditions on one value, and the form that it takes."""
 
 
 def merge(letter: str, duration: float, given: Mapping[str, Any], **own: Any) -> dict[str, Any]:
@@ -68,67 +89,27 @@ def merge(letter: str, duration: float, given: Mapping[str, Any], **own: Any) ->
 
     The sample time divides the duration in s. ``own`` are options of this experiment alone, True or False.
     """
-    known = {**DEFAULTS, **own}
+    known, who = {**DEFAULTS, **own}, f"experiment {letter}"
     for name in given:
         if name not in known:
             raise OptionError(f"experiment {letter} has no option {name!r}. {near(name, known)}", port=name)
     options = {**known, **given}
-
-    def refuse(name: str, expected: str) -> OptionError:
-        return OptionError(f"found {options[name]!r}; expected {expected}.", block=f"experiment {letter}", port=name)
-
-    for name in own:
-        if not isinstance(options[name], bool | np.bool_):
-            raise refuse(name, "True or False")
-        options[name] = bool(options[name])
-    for name, (expected, holds, made) in KINDS.items():
-        if not holds(options[name]):
-            raise refuse(name, expected)
-        options[name] = made(options[name])
-    for name in LIMITS:
-        options[name] = _limit(options[name], lambda expected, name=name: refuse(name, expected))
+    for name, (kind, convert) in {**dict.fromkeys(own, (_FLAG, bool)), **KINDS}.items():
+        check_argument(options[name], kind, name, who)
+        options[name] = convert(options[name])
     if isinstance(options["plant"], str | os.PathLike) and os.path.isdir(os.path.expanduser(options["plant"])):
         raise OptionError(
             f"{str(options['plant'])!r} is a folder; expected an FMU, a file that ends in .fmu. Name the file.",
-            block=f"experiment {letter}",
+            block=who,
             port="plant",
         )
-    options["sample_time"] = _sample_time(options["sample_time"], duration, refuse)
+    options["sample_time"] = _sample_time(options["sample_time"], duration, who)
     return options
 
 
-def is_number(value: Any) -> bool:
-    """Whether it is a finite real number, and no truth value."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
-        return False
-    try:
-        return math.isfinite(float(value))
-    except OverflowError:
-        return False
-
-
-def _limit(value: Any, refuse: Any) -> float | tuple[float | None, ...] | None:
-    """Return a limit as None, a number, or a pair whose entries are None where there is no limit."""
-
-    def entry(item: Any) -> float | None:
-        if item is None or (isinstance(item, Real) and item == math.inf):
-            return None
-        if not is_number(item) or item <= 0:
-            raise refuse("a positive number, a pair of them, or None (in a pair, too, None is no limit)")
-        return float(item)
-
-    if not isinstance(value, list | tuple | np.ndarray) or (isinstance(value, np.ndarray) and not value.ndim):
-        return entry(value.item() if isinstance(value, np.ndarray) else value)
-    if len(value) not in (1, 2):
-        entry(value)  # refuses it
-    pair = tuple(entry(item) for item in value) * (2 // len(value))
-    return None if pair == (None, None) else pair
-
-
-def _sample_time(value: Any, duration: float, refuse: Any) -> float:
+def _sample_time(value: Any, duration: float, who: str) -> float:
     """Return the sample time in s, after checking that it divides the duration."""
-    if not is_number(value) or value <= 0:
-        raise refuse("sample_time", "a positive number")
+    check_argument(value, _POSITIVE, "sample_time", who)
     span = exact_time(duration)
     try:
         time = exact_time(value)
@@ -138,9 +119,11 @@ def _sample_time(value: Any, duration: float, refuse: Any) -> float:
         return float(time)
     below, above = _divisors_near(time, span)
     fits = " or ".join(f"{float(t):.9g}" for t in (below, above) if t is not None)
-    raise refuse(
-        "sample_time",
-        f"a whole number of nanoseconds of which a whole number make the experiment's {duration:g} s, such as {fits}",
+    raise OptionError(
+        f"found {value!r}; expected a whole number of nanoseconds of which a whole number make the experiment's "
+        f"{duration:g} s, such as {fits}.",
+        block=who,
+        port="sample_time",
     )
 
 
