@@ -1,6 +1,8 @@
 """Planar paths: ellipse, circle, line, cubic spline, and the base of users' own paths."""
 
-from .path import UNLIMITED, Frame, Path, replace_unlimited
+from .curve import Frame
+from .path import Path
+from .reach import UNLIMITED, replace_unlimited
 from .shapes import Circle, Ellipse, Line
 from .spline import CubicSpline
 

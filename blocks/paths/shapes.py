@@ -7,7 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from ..core import Array, ParameterError, parameter
-from .path import UNLIMITED, Path, as_positions, check_order
+from .curve import check_order
+from .path import Path, as_positions
+from .reach import UNLIMITED
 
 __all__ = ["Circle", "Ellipse", "Line"]
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..core import Array, ParameterError, parameter
 from ..library import jet, wrap
-from .path import Path, check_order
+from .curve import check_order
+from .path import Path
 
 __all__ = ["CubicSpline"]
 

@@ -49,6 +49,9 @@ _NO_METHODS_FOR_USERS = (
 )
 """Equations and declarations of a block: its docstring has them as text."""
 
+_SHOWN_WITH_BASES_BELOW = {"Path": "Value"}
+"""Classes whose pages have the members of bases that aren't public, too, and the first base that is left out."""
+
 _TABLE = """.. list-table::
    :header-rows: 1
    :widths: 36 64
@@ -130,6 +133,8 @@ def _page(public: PublicName, picture: str) -> str:
             described = f".. autoclass:: {full}\n   :members:\n   :exclude-members: {_NO_METHODS_FOR_USERS}\n"
         case _:
             described = f".. autoclass:: {full}\n   :members:\n"
+            if base := _SHOWN_WITH_BASES_BELOW.get(public.name):
+                described += f"   :inherited-members: {base}\n"
     return ":orphan:\n\n" + _title(public.name) + where + picture + described
 
 

@@ -18,7 +18,7 @@ from scipy.special import ellipeinc
 from loopwright.blocks import DefinitionError, ParameterError, PathDomainError, TraceError, parameter
 from loopwright.blocks.library.piecewise_functions import is_traced, jet, piecewise, wrap
 from loopwright.blocks.paths import UNLIMITED, Circle, CubicSpline, Ellipse, Line, Path
-from loopwright.blocks.paths.path import _Contact
+from loopwright.blocks.paths.reach import TouchingCircles
 
 
 class Bean(Path):
@@ -374,13 +374,13 @@ def test_a_tabulated_reach_is_close_to_the_medial_axis_and_on_the_safe_side(cloc
 def test_contact_curvatures_are_exact_where_they_are_tabulated():
     path = PlainEllipse(semi_axes=(A, B), center=(0.5, 0.5))
     theta = np.linspace(0.0, 2 * np.pi, 500)
-    inverse = _Contact(path).inverse_reach(theta)
+    inverse = TouchingCircles(path).inverse_reach(theta)
     np.testing.assert_allclose(1.0 / inverse[:, 0], PAPER.reach(theta)[0], rtol=1e-7)
     assert np.all(inverse[:, 1] == 1.0 / UNLIMITED)
 
 
 def test_contact_curvature_is_smooth_where_its_series_takes_over():
-    contact = _Contact(PAPER)
+    contact = TouchingCircles(PAPER)
     x, y = exact_ellipse(PAPER)
     theta = 0.6
     phi = theta + np.array([-1.0, 1.0])[:, None] * contact.near * np.array([0.03, 0.5, 0.99, 1.01, 3.0, 9.0]) / 0.21
