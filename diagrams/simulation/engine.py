@@ -64,7 +64,7 @@ class Engine:
         self._passes_on = options.start_exchange
         self._compile, self._fuse = options.compiled, options.fuse
         self._changed = False  # whether generated code has taken over within the run
-        self._compiled: SampledTicks | HybridTicks | None = None
+        self._ticks: SampledTicks | HybridTicks | None = None
         self._in_c: PlantsInC | None = None
         self._generated = False  # whether generated code is gone through, and no virtual machine
         self.messages: tuple[str, ...] = ()
@@ -142,7 +142,7 @@ class Engine:
             self.workspace.evaluate_in_c(self._find_tick_code)
         self._find_start(choose_start_values(self.workspace))
         if self._compile is True:
-            self._make_compiled(machine=False)
+            self._generate_code()
 
     def _find_tick_code(self) -> DiagramCode:
         """Return the code of the ticks, for an evaluation of one."""
@@ -188,44 +188,43 @@ class Engine:
             plant.read(0.0)
         self._find_start(set_start or find_start_values)
 
-    def _make_compiled(self, *, machine: bool) -> None:
-        """Make the loop in C, with generated code or the virtual machine; a message says where code can't be had."""
-        plants, stops, continuous = self._plants_in_c(), self._stops.entries, self.continuous
-        options = {"every": self.every_tick, "machine": machine, "fuse": self._fuse}
-        obstacle = None if machine else find_obstacle(self.flat)
-        found: SampledTicks | HybridTicks | None = None
+    def _generate_code(self) -> None:
+        """Let generated code go from tick to tick; a message says where it can't be had."""
+        obstacle = find_obstacle(self.flat)
         if obstacle is None:
             try:
-                if continuous is None:
-                    found = SampledTicks(self.workspace, plants, stops, **options)
-                else:
-                    found = HybridTicks(continuous, plants, stops, **options)
+                self._ticks = self._make_ticks(machine=False)
+                self._generated = True
+                self.messages += self._ticks.messages
             except CompilerError as error:
-                if machine:  # the library of the virtual machine can't be had
-                    raise
                 obstacle = str(error)
-        if self._part is not None and isinstance(found, HybridTicks):
-            self._part.go_between = found.go_between
-        self._compiled, self._generated = found, found is not None and not machine
-        if found is not None and not machine:
-            self.messages += found.messages
         if obstacle is not None:
             self.messages += (f"Interpreted, though compile=True asks for C: {obstacle.rstrip('.')}.",)
+
+    def _make_ticks(self, *, machine: bool) -> SampledTicks | HybridTicks:
+        """Return the ticks in C, whose functions the virtual machine evaluates, or generated code."""
+        plants, stops = self._plants_in_c(), self._stops.entries
+        options = {"every": self.every_tick, "machine": machine, "fuse": self._fuse}
+        if self.continuous is None:
+            return SampledTicks(self.workspace, plants, stops, **options)
+        found = HybridTicks(self.continuous, plants, stops, **options)
+        if self._part is not None:
+            self._part.go_between = found.go_between
+        return found
 
     def _plants_in_c(self) -> PlantsInC:
         if self._in_c is None:
             self._in_c = PlantsInC(self.flat, self.plants, self.steps, self.coupled)
         return self._in_c
 
-    def _ticks(self) -> SampledTicks | HybridTicks:
-        """Return the loop in C, which goes from tick to tick."""
-        if self._compiled is None:
-            self._make_compiled(machine=True)
-        assert self._compiled is not None
-        return self._compiled
+    def _find_ticks(self) -> SampledTicks | HybridTicks:
+        """Return the ticks in C; without generated code, those of the virtual machine."""
+        if self._ticks is None:
+            self._ticks = self._make_ticks(machine=True)
+        return self._ticks
 
     def _hybrid_ticks(self) -> HybridTicks:
-        found = self._ticks()
+        found = self._find_ticks()
         assert isinstance(found, HybridTicks)
         return found
 
@@ -253,7 +252,7 @@ class Engine:
 
     def go(self, last: int, recorder: Recorder, progress: Progress) -> None:
         """Continue to a tick, or to where a stop condition ends the run; ``progress`` takes the time now and then."""
-        self.is_ahead, ticks = False, self._ticks()
+        self.is_ahead, ticks = False, self._find_ticks()
         if self._compile == "auto" and not self._generated:
             progress = self._change_over.watch(last, progress, ticks.make_later, self._hand_over)
         try:
@@ -268,13 +267,13 @@ class Engine:
 
     def _hand_over(self) -> None:
         """Let generated code continue where the virtual machine has come to."""
-        assert self._compiled is not None
-        self._compiled.hand_over(self._change_over.code)
+        assert self._ticks is not None
+        self._ticks.hand_over(self._change_over.code)
         self._changed = self._generated = True
 
     def prepare(self, recorder: Recorder) -> None:
         """Make what the first tick of `go` needs, which takes time, before a clock runs."""
-        self._ticks().prepare(recorder)
+        self._find_ticks().prepare(recorder)
 
     def end_between_ticks(self, end: float, recorder: Recorder, progress: Progress) -> None:
         """Continue from a tick to the end of the run, before the next tick, and record it; see `go`."""

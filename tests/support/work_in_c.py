@@ -16,4 +16,4 @@ def simulate_counted(diagram, duration, **options):
     """Return a run, and the work of its solver."""
     with diagram.simulation(**options) as simulation:
         simulation.advance(duration)
-        return simulation.run(), Work(*simulation._engine._compiled._loop.counts)
+        return simulation.run(), Work(*simulation._engine._ticks._loop.counts)

@@ -43,7 +43,7 @@ def test_a_stiff_system_with_a_loop_has_its_slope_through_the_loop():
     usual = made.simulate(5.0, **options, **QUIET)
     with made.simulation(compile=True, **options) as simulation:
         simulation.advance(5.0)
-        steps, rejected, _, slopes = simulation._engine._compiled._loop.counts
+        steps, rejected, _, slopes = simulation._engine._ticks._loop.counts
         run = simulation.run()
     a = 1e4
     exact = a * (a * np.cos(run.t) + np.sin(run.t)) / (a * a + 1.0)
