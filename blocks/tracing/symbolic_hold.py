@@ -36,11 +36,19 @@ def hold_of_symbols(rows: Any, T: float, method: str) -> tuple[Any, Any]:
     elif method == "trapezoidal":
         solve = ca.inv(eye - T / 2 * A)
         made = solve @ (eye + T / 2 * A), T * solve
+    elif n == 1:
+        made = _hold_of_one_state(A * T, T)
     else:
         both = exponential(ca.vertcat(ca.horzcat(A, eye), ca.MX(n, 2 * n)) * T)
         made = both[:n, :n], both[:n, n:]
     first, second = (wrap(ca.vec(ca.densify(part).T), (n, n)) for part in made)
     return first, second
+
+
+def _hold_of_one_state(a: Any, T: float) -> tuple[Any, Any]:
+    """Return e^a and T (e^a − 1)/a, the two of one state, which a person who reads the C code expects."""
+    none = a == 0.0
+    return ca.exp(a), T * ca.if_else(none, 1.0, ca.expm1(a) / (a + none))
 
 
 def exponential(A: Any) -> Any:

@@ -1,9 +1,13 @@
 """Linear continuous blocks in sampled subsystems: exact against the matrix exponential, Euler's methods by hand."""
 
+import casadi as ca
+import mpmath
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from loopwright.blocks.tracing.symbolic_hold import hold_of_symbols
+from loopwright.blocks.tracing.symbols import wrap
 from loopwright.diagrams import Diagram, subsystem
 from support.sampled import TICKS, T, Wave, network, run_of, wave
 
@@ -73,3 +77,16 @@ def test_the_sample_time_is_that_of_the_frame():
         np.testing.assert_allclose(rows, np.broadcast_to(x, rows.shape), rtol=1e-11, atol=1e-11)
         drive = (block.B @ wave(0.05 * k) + block.g)[:, None]
         x = (expm(np.block([[block.A, drive], [np.zeros((1, n + 1))]]) * 0.05) @ [*x, 1.0])[:n]
+
+
+def test_the_hold_of_one_state_that_is_exported_is_two_functions_of_its_time_constant():
+    """Ad = e^(aT) and Φ = T (e^(aT) − 1)/(aT), at a = 0, too; one state took the series and squarings of many."""
+    a = ca.MX.sym("a")
+    held = hold_of_symbols([[wrap(a, ())]], 0.5, "exact")
+    function = ca.Function("hold", [a], [part.to_casadi() for part in held])
+    for value in (0.0, -1e-300, 1e-9, -0.3, 2.0, -40.0, -4e3):
+        decay, gain = map(float, function(value))
+        z = mpmath.mpf(value) / 2
+        assert decay == pytest.approx(float(mpmath.exp(z)), rel=1e-15)
+        assert gain == pytest.approx(0.5 * float(mpmath.expm1(z) / z if value else 1), rel=1e-15)
+    assert function.n_instructions() < 20
