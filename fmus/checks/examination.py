@@ -7,6 +7,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -302,7 +303,7 @@ def _judge_rules(path: Path, archive: FmuArchive, known: list[FmuFinding]) -> li
             found.append(_as_error(error, path))
     seen = {a.fault for a in (*known, *found) if a.severity == FmuSeverity.ERROR}
     problems = validate(path, run=False, limits=archive.limits).problems
-    return [*found, *(FmuFinding(p.fault, p.subject, p.found, p.step) for p in problems if p.fault not in seen)]
+    return [*found, *(replace(p, severity=FmuSeverity.WARNING) for p in problems if p.fault not in seen)]
 
 
 # --- the trial ------------------------------------------------------------------------------------------------------
@@ -338,5 +339,4 @@ def _try(
         if kind == "CoSimulation":
             step = find_step(read_description(path, limits=archive.limits), summary["default_experiment"])
         return FmuTrial(kind, ran=True, seconds=took, step=step), None
-    finding = FmuFinding(FmuFault.TRIAL, kind, problem.found, problem.step, FmuSeverity.ERROR)
-    return FmuTrial(kind, ran=False, seconds=took), finding
+    return FmuTrial(kind, ran=False, seconds=took), replace(problem, subject=kind)

@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Timer
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuEnd, FmuFileError, FmuProcessError, LoopwrightError, Wanted
-from ..archive import ArchiveLimits, FmuDescription, FmuFault
+from ..archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuSeverity
 from ..isolation import Isolation
 from ..running import Fmu
 from .summary import INTERFACES
@@ -38,16 +37,6 @@ BY_END = {
 }
 
 
-@dataclass(frozen=True)
-class FmuProblem:
-    """A fault of an FMU."""
-
-    found: str  # the fault, and its place
-    step: str  # the next step
-    fault: FmuFault = FmuFault.STANDARD
-    subject: str = ""  # file of the archive; empty for the description, and for a run
-
-
 def try_out(
     file: Path,
     interface: str,
@@ -55,7 +44,7 @@ def try_out(
     limits: ArchiveLimits | None = None,
     *,
     progress: bool | Callable[[str], object] | None = None,
-) -> FmuProblem | None:
+) -> FmuFinding | None:
     """Run an FMU for some steps in its own process; return its fault, or None.
 
     In model exchange the derivatives are evaluated at the start. It must have a library for this machine. The default
@@ -78,19 +67,23 @@ def try_out(
         lost = _step(plant, experiment) if interface == "CoSimulation" else _evaluate(plant, experiment)
     except FmuProcessError as error:
         found = f"{error.message.partition('. ')[0]}.{error.printed}"  # the rest is about runs
-        return FmuProblem(f"{name}: {found}", BY_END.get(error.cause, _LOOK), FmuFault.TRIAL)
+        return _failure(f"{name}: {found}", BY_END.get(error.cause, _LOOK))
     except FmuFileError as error:
         step = "Look at what it says; it may miss a licence, a file or the program that exported it."
-        return FmuProblem(f"{name}: {split_step(error.message)[0]}", step, FmuFault.TRIAL)
+        return _failure(f"{name}: {split_step(error.message)[0]}", step)
     except LoopwrightError as error:
         found, step = split_step(error.message)
         when = "" if error.t is None else f" at t = {error.t:.9g} s"
-        return FmuProblem(f"{name}{when}: {found}", step, FmuFault.TRIAL)
+        return _failure(f"{name}{when}: {found}", step)
     finally:
         notice.cancel()
     if lost:
-        return FmuProblem(f"{name}: {lost} is no finite number.", _LOOK, FmuFault.TRIAL)
+        return _failure(f"{name}: {lost} is no finite number.", _LOOK)
     return None
+
+
+def _failure(found: str, step: str) -> FmuFinding:
+    return FmuFinding(FmuFault.TRIAL, "", found, step, FmuSeverity.ERROR)
 
 
 def _announce(file: Path, interface: str, say: Callable[[str], object]) -> None:

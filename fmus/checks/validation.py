@@ -11,7 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from ..archive import (
     ArchiveLimits,
     FmuArchive,
     FmuFault,
+    FmuFinding,
     parse_xml,
     read_library,
     repair,
@@ -29,7 +30,7 @@ from ..archive import (
 from ..platform import native_platform
 from .libraries import binaries_of, library_name, native_libraries, tuple_of
 from .summary import INTERFACES, open_fmu
-from .trial import RUNS, FmuProblem, experiment_of, try_out
+from .trial import RUNS, experiment_of, try_out
 
 _AGAIN = "Export it again with a newer version of its tool ({tool}), or report it to its makers."
 
@@ -38,7 +39,7 @@ _AGAIN = "Export it again with a newer version of its tool ({tool}), or report i
 class ValidationReport:
     """Result of a validation."""
 
-    problems: tuple[FmuProblem, ...]  # empty if the FMU is clean
+    problems: tuple[FmuFinding, ...]  # empty if the FMU is clean
     done: tuple[str, ...]  # checks and runs
     left: tuple[str, ...]  # checks that could not be done here, with the reason
 
@@ -48,20 +49,20 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
     try:
         archive, root = open_fmu(file, limits)
     except FmuFileError as error:
-        problem = FmuProblem(str(error), "Take another file: this one is not read any further.")
+        problem = _breach(str(error), "Take another file: this one is not read any further.")
         return ValidationReport((problem,), (), ())
     entries = list(archive.files)
     tool = root.get("generationTool") or "not named"
     again = _AGAIN.format(tool=tool)
     fmi = root.get("fmiVersion") or "(none)"
     if not (fmi in ("1.0", "2.0") or fmi.startswith("3.")):
-        problem = FmuProblem(f"fmiVersion is {fmi!r}; expected 1.0, 2.0 or 3.0.", again)
+        problem = _breach(f"fmiVersion is {fmi!r}; expected 1.0, 2.0 or 3.0.", again)
         return ValidationReport((problem,), (), ("everything else: the version isn't known",))
     problems = [*_archive(archive), *_description(archive, root, again)]
     done = [f"description against FMI {fmi}'s schema and rules"]
     left: list[str] = []
     if fmi != "1.0":
-        problems += [FmuProblem(found, again) for found in (*_initial_unknowns(root), *_sources(archive, root))]
+        problems += [_breach(found, again) for found in (*_initial_unknowns(root), *_sources(archive, root))]
     problems += _binaries(archive, root, tool)
     folders = binaries_of(entries)
     if folders:
@@ -83,23 +84,28 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
     return ValidationReport(tuple(problems), tuple(done), tuple(left))
 
 
+def _breach(found: str, step: str) -> FmuFinding:
+    """Return the finding of a description that breaks the standard."""
+    return FmuFinding(FmuFault.STANDARD, "", found, step)
+
+
 # --- the archive and the description --------------------------------------------------------------------------------
 
 
-def _archive(archive: FmuArchive) -> Iterator[FmuProblem]:
+def _archive(archive: FmuArchive) -> Iterator[FmuFinding]:
     """Yield the findings about the archive, and the files in it that are damaged."""
     for finding in archive.findings:
-        yield FmuProblem(_end_sentence(finding.found), finding.step, finding.fault, finding.subject)
+        yield replace(finding, found=_end_sentence(finding.found))
     for name in archive.files:
         try:
             for _ in archive.chunks(name):
                 pass
         except FmuFileError as error:
             found = f"the archive is damaged: {name}: {error}"
-            yield FmuProblem(found, "Copy or export it again.", FmuFault.DAMAGED, name)
+            yield FmuFinding(FmuFault.DAMAGED, name, found, "Copy or export it again.")
 
 
-def _description(archive: FmuArchive, root: Any, again: str) -> Iterator[FmuProblem]:
+def _description(archive: FmuArchive, root: Any, again: str) -> Iterator[FmuFinding]:
     """Yield the faults that FMPy finds (schema, start values, units, model structure), and illegal names."""
     import fmpy
     from fmpy.model_description import ValidationError
@@ -114,7 +120,7 @@ def _description(archive: FmuArchive, root: Any, again: str) -> Iterator[FmuProb
         known = [str(error)] if type(error) is Exception else repair(deepcopy(root))
         problems += known or ["the description breaks the rules of the standard, so that FMPy can't check the rest."]
     for found in problems:
-        yield FmuProblem(_end_sentence(found), _next_step(found, again))
+        yield _breach(_end_sentence(found), _next_step(found, again))
 
 
 _IDENTIFIER = r"(?:[_a-zA-Z]\w*|'(?:[\w!#$%&()*+,\-./:;<>=?@\[\]^{}| ~]|\\['\"?\\abfnrtv])+')(?:\[\d+(?:,\d+)*\])?"
@@ -197,13 +203,13 @@ def _identifiers(root: Any) -> dict[str, str]:
     return {name: element.get("modelIdentifier") for name, element in found if element is not None}
 
 
-def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuProblem]:
+def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuFinding]:
     """Yield faults of libraries: missing, of another name, cut off, or for another machine than their folder's."""
     build = f"Export it again with its tool ({tool}); if it has sources, fmpy compile builds it for this machine."
     folders = binaries_of(archive.files)
     if not folders and not any(name.startswith("sources/") for name in archive.files):
         found = "it holds neither a binary nor sources, so that nothing can run it."
-        yield FmuProblem(found, build, FmuFault.NO_BINARY)
+        yield FmuFinding(FmuFault.NO_BINARY, "", found, build)
     for folder, names in folders.items():
         platform = tuple_of(folder)
         if platform is None:
@@ -213,7 +219,7 @@ def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuProblem]
             if library not in names:
                 has = f"binaries/{folder} has no {library}, needed for {' and '.join(users)}; it has"
                 step = f"Put {library} there, or take the folder out. {build}"
-                yield FmuProblem(f"{has} {', '.join(names)}.", step, FmuFault.OTHER_NAME, f"binaries/{folder}")
+                yield FmuFinding(FmuFault.OTHER_NAME, f"binaries/{folder}", f"{has} {', '.join(names)}.", step)
                 continue
             place = f"binaries/{folder}/{library}"
             try:
@@ -224,10 +230,10 @@ def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuProblem]
                 is_for = " and ".join(header.platforms) or "no platform known here: it is no shared library"
                 found = f"{place} is for {is_for}; expected {platform}."
                 step = f"Put the library that is for {platform} there, or take the folder out."
-                yield FmuProblem(found, step, FmuFault.OTHER_PLATFORM, place)
+                yield FmuFinding(FmuFault.OTHER_PLATFORM, place, found, step)
             elif header.damage:
                 found = f"{place} can't be loaded: {header.damage}."
-                yield FmuProblem(found, "Copy or export it again.", FmuFault.TRUNCATED, place)
+                yield FmuFinding(FmuFault.TRUNCATED, place, found, "Copy or export it again.")
 
 
 # --- running --------------------------------------------------------------------------------------------------------

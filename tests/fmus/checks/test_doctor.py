@@ -281,10 +281,10 @@ def test_a_model_identifier_is_a_text_whatever_it_reads_as(tmp_path, fmi, name):
 
 
 def test_one_of_two_interfaces_may_fail(examine, monkeypatch):
-    from loopwright.fmus.checks.trial import FmuProblem
+    from loopwright.fmus.checks.trial import _failure
 
     def run(path, kind, *_, **__):
-        return FmuProblem("its first step crashed.", "Report it.") if kind == "CoSimulation" else None
+        return _failure("its first step crashed.", "Report it.") if kind == "CoSimulation" else None
 
     monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", run)
     diagnosis = examine(packed, run=True)
