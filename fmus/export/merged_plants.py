@@ -5,83 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from .c_templates import fill_template
 from .c_text import c_number
 from .loop_memory import Field
 from .own_sources import expand_sources, name_apart
 
 SAID = 512
 """Bytes of the message of a plant."""
-_HEAD = """#define LW_MERGED 1
-#define LW_N_MATRIX (%(implicit)d * LW_N_X * LW_N_X)
-"""
-_INSTANCE = """
-/* The instance, in place of the functions of FMI: it starts and is stepped as an importer starts and steps it. Pointers
-   that a call has left in it are cleared, so that equal instances have equal bytes. */
-static const uint32_t lw_plant_inputs[] = {%(inputs)s}, lw_plant_outputs[] = {%(outputs)s};
-static const uint32_t lw_plant_parameters[] = {%(parameters)s};
-static const uint8_t lw_plant_is_tunable[] = {%(tunable)s};
-
-static bool lw_plant_end(lw_instance *self, bool done) {
-    memset(self->arg, 0, sizeof self->arg);
-    memset(self->res, 0, sizeof self->res);
-    return done;
-}
-
-/* Keep what it says, behind the category. */
-static void lw_plant_say(lw_instance *self, lw_category category, const char *text) {
-    char *to = self->environment;
-    if (to[0] == LW_LOG_ERROR) return;
-    *to++ = (char)category;
-    for (int i = 0; i < %(said)d - 2 && *text; i++) *to++ = *text++;
-    *to = 0;
-}
-
-/* Begin again: start values are set, and it is initializing. */
-static bool lw_plant_enter(void *plant, double start, const double *p) {
-    static const uint32_t references[] = {%(started)s};
-    static const double values[] = {%(values)s};
-    lw_instance *self = plant;
-    self->categories = LW_LOG_WARNING | LW_LOG_ERROR;
-    lw_reset(self);
-    return lw_plant_end(self, lw_set(self, "", references, %(n_started)d, values, %(n_values)d)
-                              && lw_set(self, "", lw_plant_parameters, %(n_parameters)d, p + %(first)d, %(n_p)d)
-                              && lw_initialize(self, "", start, false, 0.0));
-}
-
-/* Set the inputs u, and get the outputs y. */
-static bool lw_plant_exchange(void *plant, const double *u, double *y) {
-    lw_instance *self = plant;
-    return lw_plant_end(self, lw_set(self, "", lw_plant_inputs, %(n_inputs)d, u, %(n_u)d)
-                              && lw_get(self, "", lw_plant_outputs, %(n_outputs)d, y, %(n_y)d));
-}
-
-/* End initialization. */
-static bool lw_plant_start(void *plant) {
-    lw_instance *self = plant;
-    return lw_plant_end(self, lw_start(self, "", LW_STEPPING));
-}
-
-/* Step from t by h with the inputs u to the outputs y. */
-static bool lw_plant_step(void *plant, const double *u, double t, double h, double *y) {
-    lw_instance *self = plant;
-    return lw_plant_end(self, lw_set(self, "", lw_plant_inputs, %(n_inputs)d, u, %(n_u)d) && lw_step(self, t, h)
-                              && lw_get(self, "", lw_plant_outputs, %(n_outputs)d, y, %(n_y)d));
-}
-
-/* Take over tunable parameters that have changed; all are set where it begins. */
-static void lw_plant_tune(void *plant, const double *p) {
-    lw_instance *self = plant;
-    const double *from = p + %(first)d;
-    for (int i = 0; i < %(n_parameters)d && self->s.mode == LW_STEPPING; i++) {
-        const lw_variable *variable = lw_variables + lw_plant_parameters[i];
-        if (lw_plant_is_tunable[i] && memcmp(self->s.values + variable->first, from, variable->size * sizeof(double)))
-            lw_set(self, "", lw_plant_parameters + i, 1, from, variable->size);
-        from += variable->size;
-    }
-    lw_plant_end(self, true);
-}
-"""
-
 Sized = Sequence[tuple[int, int]]
 """Value references of variables, each with its number of elements."""
 
@@ -128,7 +58,8 @@ class MergedPlant:
         ``…exchange``, ``…start``, ``…step`` and ``…tune``.
         """
         values = [value for _, each in self.start for value in each]
-        numbers: dict[str, object] = {
+        facts: dict[str, object] = {
+            "sources": expand_sources("model.c", self.sources),
             "implicit": int(self.implicit),
             "said": SAID,
             "inputs": _listed(reference for reference, _ in self.inputs),
@@ -147,8 +78,7 @@ class MergedPlant:
             "n_p": count(self.parameters),
             "first": self.placed.first_parameter,
         }
-        text = _HEAD % numbers + expand_sources("model.c", self.sources) + _INSTANCE % numbers
-        return name_apart(text, prefix)
+        return name_apart(fill_template("merged_plant.c", **facts), prefix)
 
 
 def write_plants(plants: Sequence[MergedPlant]) -> str:

@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import (
+    Block,
     Compare,
     Gain,
     Integrator,
@@ -15,6 +16,7 @@ from loopwright.blocks import (
     SimulationError,
     StopCondition,
     TransportDelay,
+    parameter,
 )
 from loopwright.diagrams import Coupling, Diagram, subsystem
 from loopwright.diagrams.coupling import step_all
@@ -84,6 +86,32 @@ def test_an_fmu_in_model_exchange_beside_one_in_co_simulation(cache, monkeypatch
         monkeypatch.setattr(Fmu, "description", property(lambda self: about))
         with pytest.raises(OptionError, match=r"^b\.coupling: .*canSerializeFMUState"):
             diagram.simulate(0.1, step=0.01, progress=False, coupling=scheme)
+
+
+class Called(Block):
+    """A block of a user's that a run evaluates by calls, which is no FMU."""
+
+    in_model_exchange = True
+    inner: Block = parameter(description="what is called")
+    inputs = property(lambda self: self.inner.inputs)
+    outputs = property(lambda self: self.inner.outputs)
+    states = property(lambda self: self.inner.states)
+    events = property(lambda self: self.inner.events)
+
+    def dependence(self, equation):
+        return self.inner.dependence(equation)
+
+    def exchange(self, wired, *, start_time):
+        return self.inner.exchange(wired, start_time=start_time)
+
+
+def test_a_users_block_in_model_exchange_beside_an_fmu_in_co_simulation(cache):
+    diagram = two_masses()
+    called = Called(inner=diagram["b"].replace(interface="model_exchange"), name="b")
+    diagram = diagram.replace({"b": called})
+    signals = ("a.position", "b.position")
+    errors = [largest_error(diagram, two_masses_exactly, signals, step=h, coupling="iterated")[0] for h in STEPS[1:]]
+    assert order_of(errors) == pytest.approx([2], abs=0.2)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.5])  # plain repetition diverges from 1 on
