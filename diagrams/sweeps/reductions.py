@@ -12,6 +12,7 @@ from ...blocks.core import OptionError, accepts, explain_calls, kinds
 from ..results import Run
 
 KINDS = ("final", "maximum", "minimum", "mean", "settling_time")
+_SIGNAL = kinds.text.worded("the name of a signal, such as 'y'", "Give one.")
 
 
 @explain_calls
@@ -61,31 +62,36 @@ class Reduction:
         return "s" if self.kind == "settling_time" else None
 
 
-@explain_calls
+@accepts(signal=_SIGNAL)
 def final(signal: str) -> Reduction:
     """Return the reduction to a signal's last sample."""
-    return _made("final", signal)
+    return Reduction("final", signal)
 
 
-@accepts(since=kinds.number)
+@accepts(signal=_SIGNAL, since=kinds.number)
 def maximum(signal: str, *, since: float = 0.0) -> Reduction:
     """Return the reduction to the largest sample of each entry, from a time in s on."""
-    return _made("maximum", signal, since=since)
+    return Reduction("maximum", signal, since=since)
 
 
-@accepts(since=kinds.number)
+@accepts(signal=_SIGNAL, since=kinds.number)
 def minimum(signal: str, *, since: float = 0.0) -> Reduction:
     """Return the reduction to the smallest sample of each entry, from a time in s on."""
-    return _made("minimum", signal, since=since)
+    return Reduction("minimum", signal, since=since)
 
 
-@accepts(since=kinds.number)
+@accepts(signal=_SIGNAL, since=kinds.number)
 def mean(signal: str, *, since: float = 0.0) -> Reduction:
     """Return the reduction to the mean over time, by the trapezoidal rule, from a time in s on."""
-    return _made("mean", signal, since=since)
+    return Reduction("mean", signal, since=since)
 
 
-@accepts(band=kinds.number, target=kinds.number, since=kinds.number)
+@accepts(
+    signal=_SIGNAL,
+    band=kinds.positive.worded("a distance from the target, positive", "Give one.", kinds.by_name),
+    target=kinds.number,
+    since=kinds.number,
+)
 def settling_time(signal: str, *, band: float, target: float | None = None, since: float = 0.0) -> Reduction:
     """Return the reduction to the time after which a signal stays in a band around its target.
 
@@ -103,9 +109,7 @@ def settling_time(signal: str, *, band: float, target: float | None = None, sinc
     since : float
         Time in s from which on it is counted, such as that of a step.
     """
-    if not band > 0.0:
-        raise OptionError(f"found band={band!r}; expected a distance from the target, positive.", port=signal)
-    return _made("settling_time", signal, band=float(band), target=target, since=since)
+    return Reduction("settling_time", signal, band=float(band), target=target, since=since)
 
 
 def check_reductions(reduce: Any, diagram: str) -> dict[str, Callable[[Run], Any]]:
@@ -123,12 +127,6 @@ def check_reductions(reduce: Any, diagram: str) -> dict[str, Callable[[Run], Any
                 port="reduce",
             )
     return dict(reduce)
-
-
-def _made(kind: str, signal: str, **more: Any) -> Reduction:
-    if not isinstance(signal, str):
-        raise OptionError(f"found {signal!r}; expected the name of a signal, such as {kind}('y').")
-    return Reduction(kind, signal, **more)
 
 
 def _mean(t: np.ndarray, values: np.ndarray) -> np.ndarray:

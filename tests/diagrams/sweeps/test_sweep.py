@@ -150,7 +150,7 @@ def test_settling_is_zero_within_the_band_nan_outside_at_the_end_and_reckoned_to
     assert np.isnan(found["never"]).all()
     wide = diagram.sweep({"gain.gain": (1.0,)}, 4.0, reduce={"s": settling_time("y", band=9.0)}, **INTERPRETED)
     assert wide["s"] == [0.0]
-    with pytest.raises(OptionError, match=r"y: found band=0.0; expected a distance"):
+    with pytest.raises(OptionError, match=r"settling_time.band: found band=0.0; expected a distance"):
         settling_time("y", band=0.0)
 
 
