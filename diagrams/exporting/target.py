@@ -11,7 +11,6 @@ import numpy as np
 
 from ...blocks.core import DefinitionError, OptionError, accepts, kinds
 from ...fmus.export import (
-    CLOCK_LIMIT,
     BlockOutput,
     Kept,
     LoopSpec,
@@ -31,7 +30,7 @@ from ..wiring import join
 from .loop_of_diagram import loop_spec
 from .make_exported import open_model
 from .more_functions import trace_computed_numbers
-from .obstacles import refuse
+from .obstacles import find_continuous, refuse, refuse_between_ticks, refuse_fmus
 from .open_diagram import OpenDiagram
 
 _LARGEST = 20_000
@@ -143,16 +142,16 @@ def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSp
     Raises `SimulationError` if its start isn't found.
     """
     refuse(opened)
-    _refuse_fmus(opened)
+    refuse_fmus(opened)
     if not opened.wired.has_clock:
-        continuous = [opened.shown(path) for path in _continuous(opened)]
+        continuous = [opened.shown(path) for path in find_continuous(opened)]
         raise DefinitionError(
             "found no sample time, at which a target calls tick. Give one: @subsystem(sample_time=1e-3) of the "
             "controller, or diagram.sampled(1e-3) of all.",
             block=continuous[0] if continuous else opened.wired.name,
         )
     flat = opened.wired.flatten()
-    _refuse_between_ticks(opened, flat)
+    refuse_between_ticks(opened, flat)
     loop = loop_spec(opened, name=name, description=description)
     _check_names(loop)
     acting = kinds_of(flat, every=loop.hybrid)  # what is in continuous time is computed at each tick
@@ -184,16 +183,6 @@ def _trace_numbers(
     return tuple(found), tuple(fixed)
 
 
-def _refuse_fmus(opened: OpenDiagram) -> None:
-    """Refuse FMUs: a target has the plant in front of it."""
-    for path, block in opened.wired.scheduled.blocks.items():
-        if path != opened.outside and (block.in_model_exchange or (block.stepped and not block.transport)):
-            shown = opened.shown(path)
-            raise DefinitionError(
-                "it is an FMU, and no target has one. Leave it outside: outside=[" + repr(shown) + "].", block=shown
-            )
-
-
 def _check_names(loop: LoopSpec) -> None:
     for placed in (loop.inputs, loop.outputs, loop.signals, loop.parameters, loop.states):
         check_ascii(one.variable.name for one in placed)
@@ -202,64 +191,9 @@ def _check_names(loop: LoopSpec) -> None:
 def _needs_loop(opened: OpenDiagram) -> bool:
     """Return whether anything happens between ticks, or is solved by iterations: then the loop of runs is inside."""
     refuse(opened)
-    _refuse_fmus(opened)
+    refuse_fmus(opened)
     flat = opened.wired.flatten()
-    return bool(_continuous(opened) or flat.events or flat.loops.slices)
-
-
-def _continuous(opened: OpenDiagram) -> list[str]:
-    """Return the paths of blocks with states in continuous time."""
-    table = opened.wired.scheduled
-    return [
-        path
-        for path, trace in opened.wired.checked.traced.items()
-        if not table.is_sampled(table.subsystem_of[path]) and trace.advance == "derivative" and trace.states
-    ]
-
-
-def _refuse_states(opened: OpenDiagram) -> None:
-    """Refuse blocks with states in continuous time."""
-    for path in _continuous(opened):
-        raise DefinitionError(
-            "it is in continuous time, and C in single precision has ticks alone. Take number='double', whose source "
-            "has the loop of runs inside, put it into a sampled subsystem, @subsystem(sample_time=…), or leave it "
-            f"outside: {_leave_out(opened)}.",
-            block=opened.shown(path),
-        )
-
-
-def _leave_out(opened: OpenDiagram) -> str:
-    """Return what to write, so that blocks in continuous time with states stay outside."""
-    table = opened.wired.scheduled
-    clocked = [path for path in table.subsystems if path and "." not in path and table.is_sampled(path)]
-    alone = f", or write a sampled subsystem alone: subsystem={opened.shown(clocked[0])!r}" if clocked else ""
-    return f"outside={[opened.shown(path) for path in _continuous(opened)]}{alone}"
-
-
-def _refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:
-    """Refuse what happens between ticks, and algebraic loops: nothing but ticks is on a target."""
-    _refuse_states(opened)
-    for event in flat.events:
-        raise DefinitionError(
-            f"its event {event.name!r} is between ticks, and C in single precision has ticks alone. Take "
-            "number='double', whose source has the loop of runs inside, or put it into a sampled subsystem, "
-            "sample_time=….",
-            block=opened.shown(event.path),
-        )
-    for full in flat.loops.slices:
-        path, port = flat.ports[full]
-        raise DefinitionError(
-            "an algebraic loop is solved by iterations, and C in single precision has none. Take number='double', "
-            "whose source has the loop of runs inside, or put a UnitDelay() into the loop.",
-            block=opened.shown(path),
-            port=port,
-        )
-    if len(flat.distinct) > CLOCK_LIMIT:
-        raise DefinitionError(
-            f"found {len(flat.distinct)} sample times with their offsets; at most {CLOCK_LIMIT} are on a target. "
-            "Choose fewer.",
-            block=opened.wired.name,
-        )
+    return bool(find_continuous(opened) or flat.events or flat.loops.slices)
 
 
 def _trace_tick(opened: OpenDiagram, flat: FlatDiagram, clocks: frozenset[TickPattern], name: str) -> TargetTick:
