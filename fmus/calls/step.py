@@ -1,4 +1,4 @@
-"""A communication step of an FMU: its inputs are set, time advances, its outputs are read.
+"""A communication step of an FMU, `doStep`: its inputs are set, time advances, its outputs are read.
 
 `StepParts` says what else belongs to it. It is the same step in this process and in another one, for Python and for the
 loops in C, which take it by its addresses (`InstanceStep.native`, `InstanceStep.remote`).
