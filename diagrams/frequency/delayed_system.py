@@ -131,18 +131,18 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
 
     def _values(self, s: np.ndarray) -> np.ndarray:
         """Return the transfer matrix at points, shape (points, outputs, inputs); infinite at a pole."""
-        n, m, p, q = self.rest.nstates, len(self.delays), self.noutputs, self.ninputs
-        A, B, C, D = (np.asarray(getattr(self.rest, k), dtype=float) for k in "ABCD")
-        found = np.empty((len(s), p, q), dtype=complex)
+        e, n, m = self.equations(), self.rest.nstates, len(self.delays)
+        into = np.vstack([e.B, e.F]).astype(complex)
+        found = np.empty((len(s), self.noutputs, self.ninputs), dtype=complex)
         for i, at in enumerate(s):
-            E = np.exp(-at * self.delays)
-            M = np.block([[at * np.eye(n) - A, -B[:, q:] * E], [-C[p:], np.eye(m) - D[p:, q:] * E]])
+            late = np.exp(-at * self.delays)
+            M = np.block([[at * np.eye(n) - e.A, -e.G * late], [-e.Z, np.eye(m) - e.H * late]])
             try:
-                v = np.linalg.solve(M, np.vstack([B[:, :q], D[p:, :q]]).astype(complex))
+                v = np.linalg.solve(M, into)
             except np.linalg.LinAlgError:
                 found[i] = np.inf
                 continue
-            found[i] = D[:p, :q] + C[:p] @ v[:n] + (D[:p, q:] * E) @ v[n:]
+            found[i] = e.D + e.C @ v[:n] + (e.E * late) @ v[n:]
         return found
 
     def dcgain(self) -> Any:
@@ -156,9 +156,8 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
 
     def characteristic(self) -> DelayMatrices:
         """Return the matrices of the characteristic function."""
-        p, q = self.noutputs, self.ninputs
-        A, B, C, D = (np.asarray(getattr(self.rest, k), dtype=float) for k in "ABCD")
-        return DelayMatrices(A, B[:, q:], C[p:], D[p:, q:], self.delays)
+        e = self.equations()
+        return DelayMatrices(e.A, e.G, e.Z, e.H, self.delays)
 
     def poles(self) -> np.ndarray:
         """Return the poles, the rightmost first.
@@ -198,16 +197,15 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
         OptionError
             If delays stand in ways without a state that are singular without them.
         """
-        m, p, q = len(self.delays), self.noutputs, self.ninputs
-        A, B, C, D = (np.asarray(getattr(self.rest, k), dtype=float) for k in "ABCD")
-        loop = np.eye(m) - D[p:, q:]
+        e, m = self.equations(), len(self.delays)
+        loop = np.eye(m) - e.H
         if m and np.linalg.cond(loop) > 1e12:
             raise OptionError(
                 "found delays in a way without a state that has no unique solution without them; expected one.",
                 block=self.name,
             )
-        zx, zu = np.linalg.solve(loop, C[p:]), np.linalg.solve(loop, D[p:, :q])
-        return ss(A + B[:, q:] @ zx, B[:, :q] + B[:, q:] @ zu, C[:p] + D[:p, q:] @ zx, D[:p, :q] + D[:p, q:] @ zu, 0)
+        zx, zu = np.linalg.solve(loop, e.Z), np.linalg.solve(loop, e.F)
+        return ss(e.A + e.G @ zx, e.B + e.G @ zu, e.C + e.E @ zx, e.D + e.E @ zu, 0)
 
     def pade(self, order: int = 5) -> StateSpace:
         """Return the rational model with each delay replaced by Padé's approximation of an order.
@@ -369,19 +367,11 @@ def _as_delayed(system: Any, like: DelayedSystem, *, square: bool = True) -> Del
 
 def _join(a: DelayedSystem, b: DelayedSystem, back: np.ndarray, into: np.ndarray, out: np.ndarray) -> DelayedSystem:
     """Return two systems side by side, with u = back y + into r, and out y as outputs."""
-    pa, pb, n1, n2 = a.noutputs, b.noutputs, a.rest.nstates, b.rest.nstates
-    A = np.block([[a.rest.A, np.zeros((n1, n2))], [np.zeros((n2, n1)), b.rest.A]])
+    from scipy.linalg import block_diag
 
-    def stack(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-        none = np.zeros((one.shape[0], two.shape[1])), np.zeros((two.shape[0], one.shape[1]))
-        return np.block([[one, none[0]], [none[1], two]])
-
-    def split(s: DelayedSystem) -> tuple[np.ndarray, ...]:
-        p, q, r = s.noutputs, s.ninputs, s.rest
-        return r.B[:, :q], r.B[:, q:], r.C[:p], r.C[p:], r.D[:p, :q], r.D[:p, q:], r.D[p:, :q], r.D[p:, q:]
-
-    B, G, C, Z, D, Dw, Dz, H = (stack(one, two) for one, two in zip(split(a), split(b), strict=True))
-    loop = np.eye(pa + pb) - D @ back
+    first, second = a.equations(), b.equations()
+    A, B, G, C, Z, D, Dw, Dz, H = (block_diag(getattr(first, k), getattr(second, k)) for k in "ABGCZDEFH")
+    loop = np.eye(len(D)) - D @ back
     if np.linalg.cond(loop) > 1e12:
         raise OptionError(
             "found a loop without a state and without a unique solution; expected one. Look at D of both systems.",
