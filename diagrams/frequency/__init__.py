@@ -9,12 +9,13 @@ from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .drawn_loops import DrawnLoop, phase_of
+from .frequency_data import read_frequency_data
 from .loop_drawing import draw_bode_axes, draw_nyquist_axes
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins, scan_margins
 from .loop_model import find_hidden_unstable
 from .margin_analysis import MARGIN_UNITS
 from .margin_slopes import MarginSlope, margin_slopes
-from .measured_margins import MeasuredMargins, measured_margins, read_frequency_data
+from .measured_margins import MeasuredMargins, measured_margins
 from .number import MARK, Confirmation, Interval, Number, is_at_steps_only, method_of, with_findings
 from .nyquist import NyquistCount, nyquist_count
 from .periodic_margins import PeriodicMargins, periodic_margins

@@ -96,67 +96,61 @@ def compare_with_control(loop: LinearSystem, *, delay: int = 0) -> tuple[Compari
 @on_one_thread
 def compare_margins(r: Realization, ours: Margins, L: StateSpace) -> tuple[Comparison, ...]:
     """Return computed margins with python-control's values for L; r is the realization of L."""
-    theirs = _ControlValues(L)
     judge = _Judge(r, ours)
     found = []
-    for name, (function, value, reason) in theirs.values(ours).items():
+    for name, (function, value, reason) in _ask_control(L, ours).items():
         mine = float(ours.encirclements) if name == "encirclements" else ours.numbers()[name].value
         found.append(judge.compare(name, mine, value, function, reason))
     return tuple(found)
 
 
-class _ControlValues:
-    """python-control's numbers of a loop; a function that raises gives NaN and its message."""
+def _ask_control(L: StateSpace, ours: Margins) -> dict[str, tuple[str, float, str]]:
+    """Return python-control's numbers of a loop, each with its function; one that raises gives NaN and its message."""
+    import control
 
-    def __init__(self, L: StateSpace):
-        self.L = respond_at_once(L)
+    L = respond_at_once(L)
 
-    def values(self, ours: Margins) -> dict[str, tuple[str, float, str]]:
-        import control
+    def disk() -> float:
+        poles = np.asarray(ours.closed_loop_poles, dtype=complex)
+        near = np.abs(np.log(poles[poles != 0.0]) / L.dt if L.dt else poles)  # a sharp minimum is at one of these
+        top = np.pi / L.dt if L.dt else 100 * max([1.0, *near])
+        omega = np.geomspace(top * 1e-6, top * (1 - 1e-9), 400)
+        omega = np.unique([*omega, *near[(near > omega[0]) & (near < omega[-1])]])
+        for _ in range(4):  # ever closer around the least one; 4000 frequencies at once take 100 ms
+            found = control.disk_margins(L, omega, returnall=True)[0]
+            least = int(np.argmin(found))
+            omega = np.geomspace(omega[max(least - 1, 0)], omega[min(least + 1, len(omega) - 1)], 41)
+        return float(found[least])
 
-        L = self.L
+    def bandwidth() -> float:
+        return float(control.bandwidth(respond_at_once(control.feedback(L, 1))))
 
-        def disk() -> float:
-            poles = np.asarray(ours.closed_loop_poles, dtype=complex)
-            near = np.abs(np.log(poles[poles != 0.0]) / L.dt if L.dt else poles)  # a sharp minimum is at one of these
-            top = np.pi / L.dt if L.dt else 100 * max([1.0, *near])
-            omega = np.geomspace(top * 1e-6, top * (1 - 1e-9), 400)
-            omega = np.unique([*omega, *near[(near > omega[0]) & (near < omega[-1])]])
-            for _ in range(4):  # ever closer around the least one; 4000 frequencies at once take 100 ms
-                found = control.disk_margins(L, omega, returnall=True)[0]
-                least = int(np.argmin(found))
-                omega = np.geomspace(omega[max(least - 1, 0)], omega[min(least + 1, len(omega) - 1)], 41)
-            return float(found[least])
+    def encirclements() -> float:
+        return float(control.nyquist_response(L).count)
 
-        def bandwidth() -> float:
-            return float(control.bandwidth(respond_at_once(control.feedback(L, 1))))
-
-        def encirclements() -> float:
-            return float(control.nyquist_response(L).count)
-
-        out: dict[str, tuple[str, float, str]] = {}
-        margins_of, why = _call_quietly(lambda: control.stability_margins(L))
-        gm, pm, sm, _, wgc, _ = margins_of if margins_of is not None else (np.nan,) * 6
-        low = gm if gm < 1 else np.nan
-        high = gm if gm > 1 else np.nan
-        one = "it gives one gain margin only, the other side's is not reported"
-        out["gain_margin_low"] = ("stability_margins", float(low), why or one)
-        out["gain_margin_high"] = ("stability_margins", float(high), why or one)
-        out["phase_margin_deg"] = ("stability_margins", float(pm), why)
-        if np.isinf(ours.delay_margin_s.value):
-            out["delay_margin_s"] = ("stability_margins", np.inf if np.isinf(pm) else np.nan, why)
-        else:
-            lag = np.radians(pm % 360)
-            out["delay_margin_s"] = ("stability_margins, pm/ωpm", float(lag / wgc) if wgc else np.nan, why)
-        out["modulus_margin"] = ("stability_margins", float(sm), why or "it gives none")
-        for name, function, call in (
-            ("disk_margin", "disk_margins", disk),
-            ("bandwidth", "bandwidth", bandwidth),
-            ("encirclements", "nyquist_response", encirclements),
-        ):
-            value, message = _call_quietly(call)
-            out[name] = (function, np.nan if value is None else value, message)
-        return out
+    out: dict[str, tuple[str, float, str]] = {}
+    margins_of, why = _call_quietly(lambda: control.stability_margins(L))
+    gm, pm, sm, _, wgc, _ = margins_of if margins_of is not None else (np.nan,) * 6
+    low = gm if gm < 1 else np.nan
+    high = gm if gm > 1 else np.nan
+    one = "it gives one gain margin only, the other side's is not reported"
+    out["gain_margin_low"] = ("stability_margins", float(low), why or one)
+    out["gain_margin_high"] = ("stability_margins", float(high), why or one)
+    out["phase_margin_deg"] = ("stability_margins", float(pm), why)
+    if np.isinf(ours.delay_margin_s.value):
+        out["delay_margin_s"] = ("stability_margins", np.inf if np.isinf(pm) else np.nan, why)
+    else:
+        lag = np.radians(pm % 360)
+        out["delay_margin_s"] = ("stability_margins, pm/ωpm", float(lag / wgc) if wgc else np.nan, why)
+    out["modulus_margin"] = ("stability_margins", float(sm), why or "it gives none")
+    for name, function, call in (
+        ("disk_margin", "disk_margins", disk),
+        ("bandwidth", "bandwidth", bandwidth),
+        ("encirclements", "nyquist_response", encirclements),
+    ):
+        value, message = _call_quietly(call)
+        out[name] = (function, np.nan if value is None else value, message)
+    return out
 
 
 def respond_at_once(system: StateSpace) -> StateSpace:

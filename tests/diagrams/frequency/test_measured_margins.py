@@ -116,6 +116,7 @@ def test_a_file_comes_in(tmp_path, header, columns):
         ("omega,hz,real,imag\n1,2,3,4", "expected one of rad/s, omega"),
         ("omega,real,imag\n1,2,3\n2,x,1", "line 3 has no number in the column 'real'"),
         ("omega,real,imag\n1,2", "line 2 has no number in the column 'imag'"),
+        ("omega,real,imag,Real\n1,2,3,4", "the column 'real' twice; expected each one once"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(tmp_path, text, message):
