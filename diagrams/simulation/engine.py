@@ -66,7 +66,7 @@ class Engine:
         self._changed = False  # whether generated code has taken over within the run
         self._ticks: SampledTicks | HybridTicks | None = None
         self._in_c: PlantsInC | None = None
-        self._generated = False  # whether generated code is gone through, and no virtual machine
+        self._generated = False  # whether generated code runs, and no virtual machine
         self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist or bool(self.exchanged)
         self.is_ahead = False
@@ -168,7 +168,7 @@ class Engine:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether generated code is gone through from tick to tick."""
+        """Whether generated code goes from tick to tick."""
         return self._generated
 
     @property

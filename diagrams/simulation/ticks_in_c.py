@@ -1,4 +1,4 @@
-"""The ticks of a run, gone through in C: what runs with continuous states and without them share."""
+"""The ticks of a run in C: what runs with continuous states and without them share."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ class SimulationView:
 
     @property
     def tick(self) -> int:
-        """Number of the last tick that was gone through; a run that is stopped between two ticks is beyond it."""
+        """Number of the last tick that the run has reached; one that is stopped between two ticks is beyond it."""
         return self._position.tick
 
     @property
