@@ -1,7 +1,7 @@
 """SSPs of other tools, run by Loopwright and by other readers: python benchmarks/foreign_ssps.py FILE ... --step 0.01.
 
 FILE is an .ssp, or a folder with SystemStructure.ssd and the files next to it. The readers are FMPy, ecos (ecospy) and
-libcosim (libcosimpy); one that isn't installed is left out. Each run has a process of its own and a time limit. A line
+libcosim (libcosimpy); one that isn't installed is left out. Each run has its own process and a time limit. A line
 for each reader says how many outputs of the FMUs, of type real, have the same bits at the end, and the largest
 difference, relative to 1 + the value. Without FILE a small SSP of our own is run.
 
@@ -82,7 +82,7 @@ def compare(file: str, given: argparse.Namespace, folder: Path) -> None:
 
 
 def run(reader: str, file: str, given: argparse.Namespace, names: list[str]) -> dict[str, float] | str:
-    """Return the outputs at the end of a run in a process of its own, or why there are none."""
+    """Return the outputs at the end of a run in its own process, or why there are none."""
     options = ["--reader", reader, "--step", str(given.step), "--stop", str(given.stop), "--set", given.set]
     try:
         done = subprocess.run(

@@ -5,8 +5,8 @@ of FMUs (motors, each with its own controller, 1 kHz), the throughput of a sweep
 (experiment C of Fig. 3, 2 s a run), and events over the number of bouncing balls in one diagram. Each in the compiled
 and, where it says so, in the interpreted form; everything is recorded, but in the chain and in the sweep, which keep
 one signal, and one number of each run. Times of one thread are the processor's, those of a sweep are elapsed; the
-smallest of a few counts. The numbers are printed, too. The plot goes to benchmarks/out/growth.png, or where it is told
-to; benchmarks/images/growth.png is one such.
+smallest of a few counts. The numbers are printed, too. The plot goes to benchmarks/out/growth.png, or to the picture
+that is named; benchmarks/images/growth.png is one such.
 """
 
 from __future__ import annotations

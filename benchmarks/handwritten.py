@@ -114,14 +114,14 @@ def task(substeps: int, projections: int, record: int) -> Task:
     return found
 
 
-def compile_by_hand(folder: Path, *, told: bool = True) -> tuple[ctypes.CDLL, Path]:
+def compile_by_hand(folder: Path, *, shown: bool = True) -> tuple[ctypes.CDLL, Path]:
     """Return the library of the hand-written C, and a program of it for counting."""
     library, program = folder / "by_hand.so", folder / "by_hand"
     gcc = shutil.which("gcc")
     compiler = [gcc] if gcc else [sys.executable, "-m", "ziglang", "cc"]
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     processor = f"-march={'x86-64-v3' if gcc else 'x86_64_v3'}" if x86 else "-mcpu=native"
-    if told:
+    if shown:
         print(f"C by hand is compiled by {'gcc' if gcc else 'zig cc'} {processor} {' '.join(FLAGS)}")
     for flags in (("-shared", "-fPIC", "-o", library), ("-DPROGRAM", "-o", program)):
         subprocess.run([*compiler, processor, *FLAGS, *flags, SOURCE, "-lm"], check=True)
@@ -182,15 +182,15 @@ def count_ours(form: str) -> float | None:
 
 def _collected(command: list[str | Path], *options: str) -> int:
     """Return the instructions of a program that valgrind has counted."""
-    told = subprocess.run(
+    printed = subprocess.run(
         ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", *options, *command],
         capture_output=True,
         text=True,
         check=True,
         env={**os.environ, "PYTHONHASHSEED": "0"},
     ).stderr
-    found = re.search(r"Collected\s*:\s*(\d+)", told)
-    assert found is not None, told
+    found = re.search(r"Collected\s*:\s*(\d+)", printed)
+    assert found is not None, printed
     return int(found.group(1))
 
 

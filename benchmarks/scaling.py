@@ -3,7 +3,7 @@
 Chains, nested boxes, a net of feedback, sampled and continuous, of 10 to 10,000 blocks. Building is what `Diagram(…)`
 does, preparing is the rest until an interpreted run can start (flattening, functions, start), stepping is a tick, or
 one step of RK4 with the four evaluations of the rates. Compiling is what `compile=True` adds to flattening, with a
-cache that has the library. Steps in C are told with one signal recorded, and with all. Next to them stands the least
+cache that has the library. Steps in C are measured with one signal recorded, and with all. Next to them is the least
 that recording can take: writing as many numbers, once each, to memory that the process has just been given.
 
 A virtual machine may be given its memory by its host at the first touch since it was started, which took 22 ns a number
@@ -11,7 +11,7 @@ where later runs take 1. So the program first fills as much memory as all its re
 the first and the second time.
 
 Exponents are fitted over the sizes from 100 blocks on: 1 is linear. Times are the processor's, the smallest of three.
-The plot goes to benchmarks/out/scaling.png, or where it is told to; benchmarks/images/scaling.png is one such.
+The plot goes to benchmarks/out/scaling.png, or to the picture that is named; benchmarks/images/scaling.png is one such.
 """
 
 from __future__ import annotations

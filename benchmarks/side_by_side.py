@@ -41,13 +41,13 @@ class Row:
     form: str
     time: float
     of: str
-    beside: str
+    reference: str
     ratios: Sequence[float]
 
     def __str__(self) -> str:
         middle = statistics.median(self.ratios)
         shown = f"{middle:8.3g}  {min(self.ratios):8.3g} to {max(self.ratios):<8.3g}"
-        return f"{self.work:27} {self.form:25} {self.time * 1e6:10.3f} {self.of:5}  {shown} {self.beside}"
+        return f"{self.work:27} {self.form:25} {self.time * 1e6:10.3f} {self.of:5}  {shown} {self.reference}"
 
 
 def ratios(others: Sequence[float], own: Sequence[float]) -> list[float]:
@@ -147,7 +147,7 @@ def all_rows(*, quick: bool, wrong: list[str]) -> Iterator[Row | str]:
         yield from beside_c(found)
         yield from beside_interpreted(wrong)
         samples = 50 if quick else 1000
-        swept = sweep.measure(samples, told=False)
+        swept = sweep.measure(samples, shown=False)
         if not sweep.is_right(swept.differences):
             wrong.append("a run of a sweep next to a single one")
         yield from sweeps(swept, samples)

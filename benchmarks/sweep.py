@@ -66,11 +66,11 @@ class Measured:
     differences: dict[str, float]
 
 
-def measure(samples: int, *, told: bool = True) -> Measured:
+def measure(samples: int, *, shown: bool = True) -> Measured:
     """Let all forms take turns; tell the compiler of the C by hand."""
     diagram = experiments.hand_guiding().diagram
     with tempfile.TemporaryDirectory() as folder:
-        library, _ = compile_by_hand(Path(folder), told=told)
+        library, _ = compile_by_hand(Path(folder), shown=shown)
 
     def sweep(duration: float, workers: int, lanes: bool | int, count: int = samples):
         return diagram.sweep(

@@ -614,7 +614,7 @@ class Diagram(ShownAsTable):
 
         It is continuous where everything is continuous. With sampled subsystems it is discrete, over one base period
         or, with several rates, their least common one; hold, delay and the time between ticks are exact. Its
-        ``findings`` say what it does not follow, such as stairs and kinks; loops and their numbers carry them.
+        ``findings`` say what it does not follow, such as stairs and kinks; loops and their numbers have them, too.
 
         Parameters
         ----------

@@ -153,7 +153,7 @@ class DoubleDriveError(WiringError):
 
 
 class DuplicateNameError(WiringError):
-    """Two blocks or wires of one subsystem carry the same name."""
+    """Two blocks or wires of one subsystem have the same name."""
 
 
 class UnknownNameError(WiringError, KeyError):

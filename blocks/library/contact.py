@@ -65,8 +65,8 @@ class SpringDamper(Block):
         n = shape_of(value)
         if shape_of(factor) not in ((), n, (*n, *n)):
             raise ShapeError(
-                f"found shape {shape_of(factor)} beside a position of shape {n}; expected a number, one for each axis, "
-                "or a square matrix. Give another one.",
+                f"found shape {shape_of(factor)} next to a position of shape {n}; expected a number, one for each "
+                "axis, or a square matrix. Give another one.",
                 port=name,
             )
         return factor @ value if len(shape_of(factor)) == 2 else factor * value

@@ -80,7 +80,7 @@ class Requirement(Block):
     upper: float | None = parameter(default=None, description="largest value allowed")
     on_violation: str = parameter(
         default="error",
-        description="'error' stops the run, 'record' lets it go on",
+        description="'error' stops the run, 'record' lets it continue",
         kind=kinds.choice("error", "record"),
     )
     u = Input(shape=None, description="a quantity, or a logic signal that must stay true")
@@ -156,5 +156,5 @@ class Requirement(Block):
         expected = " and ".join(bounds) or "true (above 0.5)"
         return GuardError(
             f"the requirement {self.requirement!r} is violated: found u = {found}; expected {expected}. Look at what "
-            "led to it in error.run, or give on_violation='record' to let the run go on."
+            "led to it in error.run, or give on_violation='record' to let the run continue."
         )

@@ -131,7 +131,7 @@ class AdmittanceLoop(Value):
     feed_forward: float = parameter(default=1.0, unit="1", description="share φ of ë that is fed forward")
     cancelled: float = parameter(default=1.0, unit="1", description="share β of the measured force that is cancelled")
     tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass beyond the force sensor, of M")
-    findings: tuple[Finding, ...] = parameter(default=(), description="kinks and stairs that its numbers carry")
+    findings: tuple[Finding, ...] = parameter(default=(), description="kinks and stairs that limit its numbers")
 
     @classmethod
     def of(cls, diagram: Diagram, side: str = "perp", *, point: OperatingPoint | None = None, **changes: Any) -> Self:

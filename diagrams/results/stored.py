@@ -131,7 +131,7 @@ class End(TypedDict, total=False):
 
 def header(diagram: str, signals: RecordedSignals, *, residual: bool = False) -> Header:
     """Return the header of a run of ``diagram``; with ``residual`` each row ends with that of the algebraic loops."""
-    # Entries count from 1 and carry their port's name: other tools read these column names.
+    # Entries count from 1 and have their port's name: other tools read these column names.
     layout, units, width, columns = signals.layout, signals.units, signals.width, signals.columns
     entries = [""] * width
     for name, where in layout.slices.items():

@@ -47,7 +47,7 @@ def test_shapes_that_do_not_fit_a_spring():
     ):
         force(SpringDamper(stiffness=1.0), position=np.zeros(2), velocity=np.zeros(3))
     with pytest.raises(
-        ShapeError, match=r"spring_damper\.stiffness: found shape \(3, 3\) beside a position of shape \(2,\)"
+        ShapeError, match=r"spring_damper\.stiffness: found shape \(3, 3\) next to a position of shape \(2,\)"
     ):
         force(SpringDamper(stiffness=np.eye(3)), position=np.zeros(2))
     with pytest.raises(
