@@ -55,7 +55,7 @@ def choose_internal_step(spec: ModelSpec) -> ModelSpec:
 
 
 def compare_internal_step(spec: ModelSpec) -> ModelSpec:
-    """Return a model whose step is described as coarse where it is, beside the fastest mode; it warns, too."""
+    """Return a model whose step is described as coarse, and warn, where it is too long for the fastest mode."""
     fastest = find_fastest_mode(spec)
     if spec.integrator != "rk4" or not fastest * spec.internal_step > COARSE:
         return spec

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from .c_expressions import OF_TIME, NumberText
 from .c_templates import fill_template
 from .c_text import c_constant, fill_lines
 from .elementary_tables import prepare_functions, prepare_single, read_runtime
-from .expressions import OF_TIME, NumberText
 from .model_spec import Variable
 from .scalar_operations import Tables
 from .target_layout import TargetLayout
