@@ -52,6 +52,7 @@ def check_structure(
         return
     if fmu.is_built_here or fmu.setup.dependencies == "all" or (x.size and not about.states):
         return
+    # values by rows, and what they may follow by columns: states first, then smooth inputs, as in a model's x and u
     ports = [p for p, v in fmu.setup.output_variables.items() if v.type == "Float64" and is_smooth(v)]
     rows = [fmu.setup.output_variables[p] for p in ports]
     rows += [about.find(name) for name in about.states.values()]
@@ -70,6 +71,7 @@ def check_structure(
                 first += v.size
         return evaluate(t, moved[: x.size], inputs).copy()
 
+    # everything is moved a little from the point itself, where the FMU can be evaluated for certain
     start = np.concatenate([x, *(u[places[port]] for _, port in columns if port is not None)])
     step = _choose_steps([v for v, _ in columns], start)
     names, knowns = (
