@@ -19,8 +19,8 @@ from ...fmus.models import gantry
 from ...fmus.platform import native_platform
 from ...fmus.toolchain import TARGETS
 from ..exporting import name_of
-from .arguments import as_json, parse_positive
 from .command import Command, argument, flag, several
+from .command_arguments import as_json, parse_positive
 from .text import say, say_json, size_text
 from .user_models import load_user_model
 

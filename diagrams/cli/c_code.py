@@ -13,8 +13,8 @@ from ...blocks.core import OptionError, explain_disk_errors
 from ..exporting import to_c
 from ..paper import Experiment
 from ..wiring import Subsystem
-from .arguments import as_json
 from .command import Command, argument, flag, several
+from .command_arguments import as_json
 from .subjects import find_diagram
 from .text import say, say_json
 from .user_models import load_user_file

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ...fmus.archive import ArchiveLimits
 from ...fmus.checks import doctor
-from .arguments import as_json
 from .command import Command, argument
+from .command_arguments import as_json
 from .text import check_file, say, say_json
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .arguments import DIAGRAM, DIAGRAM_TEXT, as_json
 from .command import Command, argument, flag
+from .command_arguments import DIAGRAM, DIAGRAM_TEXT, as_json
 from .subjects import open_user_diagram
 from .text import say, say_json
 

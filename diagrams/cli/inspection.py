@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ...fmus.checks import INTERFACES, summarize
-from .arguments import as_json
 from .command import Command, argument, flag
+from .command_arguments import as_json
 from .ssp import inspect_ssp
 from .subjects import is_ssp
 from .text import check_file, fit, say, say_json, size_text

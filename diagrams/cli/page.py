@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ...blocks.core import OptionError
 from ..paper import experiments
-from .arguments import as_json
 from .command import Argument, Command, argument, repeated
+from .command_arguments import as_json
 from .subjects import open_user_diagram
 from .text import say, say_json
 

@@ -33,8 +33,8 @@ from ..requirements import (
     read_requirements,
 )
 from ..simulation import work_notes
-from .arguments import PLANT, experiment_option, parse_pairs
 from .command import Command, argument, flag, repeated
+from .command_arguments import PLANT, experiment_option, parse_pairs
 from .subjects import open_subject
 from .text import say
 

@@ -6,9 +6,9 @@ import argparse
 
 from ...blocks.core import OptionError
 from ..paper import DEFINITIONS
-from .arguments import PLANT, as_json, duration, experiment_option, set_parameters, solver, step
 from .command import Argument, Command, argument, repeated
-from .experiment_options import option_lines
+from .command_arguments import PLANT, as_json, duration, experiment_option, set_parameters, solver, step
+from .options_of_experiments import option_lines
 from .run_diagram import run_diagram
 from .run_experiments import run_experiments
 from .subjects import is_user_file

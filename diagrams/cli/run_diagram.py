@@ -10,7 +10,7 @@ from typing import Any
 
 from ...blocks.core import LoopwrightError, OptionError, describe_disk_error, write_text
 from ..results import Run
-from .arguments import change_diagram, given_options
+from .command_arguments import change_diagram, given_options
 from .record import make_folder, record, replace_files
 from .subjects import open_user_diagram, proposed
 from .text import finite_or_none, say, say_json

@@ -16,7 +16,7 @@ from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, Theory, key_numbers, theory_numbers
 from ..results import Run
-from .experiment_options import parse_letters, parse_options, parse_renames, share
+from .options_of_experiments import parse_letters, parse_options, parse_renames, share
 from .record import make_folder, record, replace_files
 from .text import fit, say
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..ssp import SspDescription, read_ssp
-from .arguments import DIAGRAM, as_json, change_diagram, parse_positive, set_parameters
 from .command import Command, argument, flag
+from .command_arguments import DIAGRAM, as_json, change_diagram, parse_positive, set_parameters
 from .subjects import open_user_diagram, split_ssp
 from .text import say, say_json
 

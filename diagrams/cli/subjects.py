@@ -14,7 +14,7 @@ from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
 from ..ssp import read_ssp
-from .experiment_options import parse_options, share
+from .options_of_experiments import parse_options, share
 from .text import say
 from .user_models import line_text, load_user_file
 

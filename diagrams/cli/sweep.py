@@ -12,7 +12,8 @@ import numpy as np
 
 from ...blocks.core import OptionError, explain_disk_errors, near, replace_file
 from ..diagram import Diagram
-from .arguments import (
+from .command import Command, argument, repeated
+from .command_arguments import (
     DIAGRAM,
     DIAGRAM_TEXT,
     as_json,
@@ -25,7 +26,6 @@ from .arguments import (
     solver,
     step,
 )
-from .command import Command, argument, repeated
 from .subjects import open_user_diagram
 from .text import finite_or_none, say, say_json
 

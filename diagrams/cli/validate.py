@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from ...fmus.checks import validate
-from .arguments import as_json
 from .command import Command, argument, flag
+from .command_arguments import as_json
 from .text import check_file, say, say_json
 
 

@@ -24,7 +24,7 @@ LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
 
 
-class _Traced:
+class _TracedFunctions:
     """CasADi functions that become C functions of one library."""
 
     def __init__(self, functions: Sequence[Any]):
@@ -60,7 +60,7 @@ class _InStages:
         return Staged(self._schedule, found) if self._schedule.opaque else found[0]
 
 
-class ExpandedFunctions(_Traced):
+class ExpandedFunctions(_TracedFunctions):
     """Ticks, and functions between them, as one function of scalar operations each."""
 
     def __init__(self, flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], between: Sequence[str] = ()):
@@ -132,7 +132,7 @@ def _trace_slope(flat: FlatDiagram) -> Any:
     return share_terms(ca.Function("slope", symbols, [slopes]), "slope")
 
 
-class LoopEquations(_Traced):
+class LoopEquations(_TracedFunctions):
     """The equations of the algebraic loops at ticks that have some: their mismatch, and its derivative."""
 
     def __init__(self, flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]]):

@@ -53,7 +53,7 @@ from .beginning import EXACT, find_beginning, find_continuous_beginning
 from .between_samples import moves_between
 from .injection import InjectionRun, inject_signal
 from .measurement import Measurement, measure_part, refine_tolerances
-from .samples import Samples
+from .samples_at_wire import SamplesAtWire
 from .waveforms import KINDS, Part, choose_step, plan_signal
 
 if TYPE_CHECKING:
@@ -286,7 +286,7 @@ def frequency_response(
     flat = variant.flatten(chosen.get("step", None if point is None or diagram.has_clock else point.base))
     signal = find_signal(flat, cut)
     tick = point.tick if point is not None else round(t0 / float(flat.base))
-    samples = Samples.of(flat, signal, tick) if discrete else Samples(1, flat.base)
+    samples = SamplesAtWire.of(flat, signal, tick) if discrete else SamplesAtWire(1, flat.base)
     dt = float(samples.period)
     if not omega[-1] * dt < np.pi:
         raise OptionError(

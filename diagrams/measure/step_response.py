@@ -36,7 +36,7 @@ from .beginning import can_start_at, with_ticks
 from .between_samples import BETWEEN, SMOOTH, Instants, WithinSamples, can_step_finer, choose_instants, moves_between
 from .injection import InjectionRun, inject_signal
 from .predicted_step import Predicted, find_final, predict, predict_within
-from .samples import Samples
+from .samples_at_wire import SamplesAtWire
 
 SAMPLES = 1000
 """Samples of the response of a diagram that is not sampled."""
@@ -205,9 +205,9 @@ def step_response(
     names = list(outputs)
     taps = [find_signal(flat, name) for name in names]
     if sampled:
-        samples = Samples.of(flat, signal, begins.tick, each_renewal=True)
+        samples = SamplesAtWire.of(flat, signal, begins.tick, each_renewal=True)
     else:
-        samples = Samples(int(longest / flat.base), flat.base * int(longest / flat.base))
+        samples = SamplesAtWire(int(longest / flat.base), flat.base * int(longest / flat.base))
     count = max(2, math.ceil(length / float(samples.period)) + sampled)  # a step that is held begins a sample later
     # Signals that move on between the samples are read there, too, as far as FMUs take steps so short.
     follows = [flat.table.blocks[tap.port[0]].stepped or moves_between(flat, tap.port) for tap in (signal, *taps)]
@@ -281,7 +281,7 @@ def step_response(
 
 
 def _record(
-    run: InjectionRun, samples: Samples, count: int, instants: Instants, height: float, size: float
+    run: InjectionRun, samples: SamplesAtWire, count: int, instants: Instants, height: float, size: float
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """Return v and the outputs at all instants of a run, the step as the consumers got it, and whether v is held.
 
@@ -318,7 +318,7 @@ def _predict(
     wire: str,
     names: Sequence[str],
     stairs: str | None,
-    samples: Samples,
+    samples: SamplesAtWire,
     instants: Instants,
     within: WithinSamples | None,
     d: np.ndarray,

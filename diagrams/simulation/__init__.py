@@ -1,6 +1,7 @@
 """The loop over ticks, and between them."""
 
 from .algebraic_loops import newton_options
+from .block_start_values import find_initial_state, find_start_values, values_from_left
 from .bound_loops import bind_hybrid, bind_ticks
 from .continuous import Continuous
 from .engine import Engine
@@ -13,9 +14,8 @@ from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions,
 from .simulation import Simulation, simulate
 from .solver_setup import find_late, next_instant
 from .start_at_point import apply_point, copy_states
-from .start_values import find_initial_state, find_start_values, values_from_left
 from .stops import StopConditions
-from .traced_start_values import Port, StartFunctions, StartValues, trace_start
+from .traced_start_values import Port, StartFunctions, TracedStartValues, trace_start
 from .view import SimulationView
 from .workspace import Workspace
 
@@ -35,8 +35,8 @@ __all__ = [
     "Simulation",
     "SimulationView",
     "StartFunctions",
-    "StartValues",
     "StopConditions",
+    "TracedStartValues",
     "Workspace",
     "apply_point",
     "bind_hybrid",

@@ -15,6 +15,7 @@ from ..flat import FlatDiagram, announcers, renumber
 from ..model_exchange import BlocksInModelExchange, OwnEvents
 from ..results import Occurrence
 from ..solvers import METHODS, Method, MethodKind, Problem
+from .block_start_values import domains_from_left
 from .failed_blocks import state_values
 from .solver_setup import (
     absolute_tolerances,
@@ -25,7 +26,6 @@ from .solver_setup import (
     scales_of,
     time_scale_of,
 )
-from .start_values import domains_from_left
 from .workspace import Workspace
 
 _AT_ONCE = 1e-6

@@ -20,6 +20,7 @@ from ..flat import FlatDiagram
 from ..model_exchange import BlocksInModelExchange, ModelExchangeBlock
 from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
+from .block_start_values import find_start_values
 from .change_over import ChangeOver
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
@@ -30,7 +31,6 @@ from .plants_in_c import PlantsInC
 from .run_options import RunOptions
 from .sampled_ticks import SampledTicks
 from .start_at_point import check_past, start_at, take_over
-from .start_values import find_start_values
 from .stops import StopConditions
 from .ticks_in_c import find_code, functions_of
 from .traced_start_values import choose_start_values

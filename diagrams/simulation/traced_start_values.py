@@ -12,13 +12,13 @@ import numpy as np
 
 from ...blocks.core import Block
 from ..flat import NONE, FlatDiagram, Instant, bind_function, evaluate, is_true, speed_up
-from .start_values import find_initial_state, find_start_values, values_from_left
+from .block_start_values import find_initial_state, find_start_values, values_from_left
 from .workspace import Workspace
 
 Port = tuple[str, str]
 
 
-class StartValues:
+class TracedStartValues:
     """Computes what `find_start_values` does, from functions that are traced once."""
 
     def __init__(self, workspace: Workspace):
@@ -148,9 +148,9 @@ def choose_start_values(workspace: Workspace) -> Callable[[Workspace], None]:
     flat = workspace.flat
     known = _known_of(flat)
     known.runs += 1  # to trace takes as long as some starts, and a diagram may run once
-    if known.runs == 1 or flat.by_block or not StartValues.fits(flat):
+    if known.runs == 1 or flat.by_block or not TracedStartValues.fits(flat):
         return find_start_values
-    return StartValues(workspace).set
+    return TracedStartValues(workspace).set
 
 
 def trace_start(flat: FlatDiagram, left: Mapping[Port, np.ndarray]) -> StartFunctions:

@@ -15,7 +15,7 @@ from ...fmus.calls import FmuInstance
 from ..coupling import note_loops, note_steps
 from ..flat import EVERY, FlatDiagram, WiredDiagram, renumber
 from ..results import Occurrence, Recorder, Recording, Run, Stopped
-from ..simulation import Engine, RunOptions, StartValues, default_step, note_held_inputs, refuse_rest, ticks_in
+from ..simulation import Engine, RunOptions, TracedStartValues, default_step, note_held_inputs, refuse_rest, ticks_in
 from .variation import Numbers
 
 LOADING = threading.Lock()
@@ -55,7 +55,7 @@ class BoundRun:
         )
         self._has_begun = False
         self._messages_before: dict[str, int] = {}
-        self._start = StartValues(self.engine.workspace) if StartValues.fits(self.flat) else None
+        self._start = TracedStartValues(self.engine.workspace) if TracedStartValues.fits(self.flat) else None
         self._stack = ExitStack()
 
     def __enter__(self) -> BoundRun:

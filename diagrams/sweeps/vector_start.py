@@ -15,7 +15,7 @@ from ..simulation import (
     START_SETTLED,
     Port,
     StartFunctions,
-    StartValues,
+    TracedStartValues,
     find_initial_state,
     trace_start,
     values_from_left,
@@ -37,7 +37,7 @@ class StartSearch:
         self.left: Mapping[Port, np.ndarray] = {}
         self.functions: StartFunctions | None = None
         self.source: StartSource | None = None
-        if flat.hybrid or not StartValues.fits(flat):
+        if flat.hybrid or not TracedStartValues.fits(flat):
             return
         with LOADING:
             workspace = bound.engine.workspace
@@ -195,7 +195,7 @@ class VectorStart:
         return good
 
     def _set_start(self, vectors: LaneVectors, group: Sequence[Numbers]) -> np.ndarray:
-        """Compute initial states, first held outputs and gates, as `StartValues.set` does."""
+        """Compute initial states, first held outputs and gates, as `TracedStartValues.set` does."""
         flat, calls, functions = self._flat, self._calls, self._functions
         assert calls is not None
         x, good, k = vectors.x, np.ones(len(group), dtype=bool), 0

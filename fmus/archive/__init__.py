@@ -9,11 +9,11 @@ from .gathering import read_index
 from .joining import join_scalars
 from .library_headers import SharedLibrary, read_library
 from .model_exchange_description import ModelExchangeInfo
+from .parsed_xml import parse_xml
 from .repair import repair
 from .unit_definitions import FmuUnits
 from .unpacking import unpack, unpack_archive, write_files
 from .variables import FmuVariable, OtherVariable, inexact
-from .xml_text import parse_xml
 from .zip_file import BUILD_DESCRIPTION, DESCRIPTION, FmuArchive
 
 __all__ = [

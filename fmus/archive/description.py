@@ -38,13 +38,13 @@ from .fmpy_description import read_model
 from .gathering import Elements, gather
 from .model_exchange_description import ModelExchangeInfo, read_model_exchange
 from .negated import judge_negated, read_negated
+from .parsed_xml import parse_xml
 from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
 from .sizes import resize
 from .states import find_states, read_derivatives
 from .unit_definitions import FmuUnits
 from .variable_table import variable_grid
 from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_other, read_variable
-from .xml_text import parse_xml
 from .zip_file import DESCRIPTION, OTHER_PLACE, FmuArchive
 
 _DROPPED = ("UInt", "Clock")

@@ -17,7 +17,7 @@ from .archive_limits import ArchiveLimits
 from .entries import check_entries
 from .faults import FmuFault, FmuFinding
 from .library_headers import LFS_POINTER
-from .xml_text import parse_xml
+from .parsed_xml import parse_xml
 
 DESCRIPTION = "modelDescription.xml"
 BUILD_DESCRIPTION = "sources/buildDescription.xml"

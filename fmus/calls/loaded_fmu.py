@@ -26,9 +26,9 @@ from ..isolation import Isolation
 from ..platform import is_built_here
 from .fmi_calls import FATAL, WARNING
 from .fmu_setup import FmuSetup
+from .instance_start import InstanceStart
 from .loading import load_calls
 from .message_log import MessageLog, clean_text, describe_end
-from .start_values import StartValues
 from .step_options import choose_modes
 from .text_values import (
     Text,
@@ -82,7 +82,7 @@ class LoadedFmu:
             _OPEN.add(self)
         self.inputs = {port: setup.input_variables[port] for port in wired}
         self.record = TextRecord(self.fmi, setup.text_variables)
-        self._starts = StartValues(self.fmi, setup, self.set_values, self.read_variables)
+        self._starts = InstanceStart(self.fmi, setup, self.set_values, self.read_variables)
 
     def _load(self, limits: Isolation | None) -> None:
         """Load its library, in a process with limits or in this one, and make the instance."""

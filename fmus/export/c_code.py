@@ -20,8 +20,8 @@ from ...blocks.core import DefinitionError
 from ..runtime import read_sources
 from .c_text import c_array
 from .elementary_tables import prepare_functions, restore_functions
-from .entries import Entry, layout
 from .model_spec import DIRECTIONS, ModelSpec
+from .variable_entries import Entry, layout
 
 _SHARED = ("linear.c", "fixed_step.c", "embedded.c", "crossings.c")  # of loopwright.fmus.runtime
 _COMMON = ("model.h", "elementary.c", "core.c", "integrators.c", "events.c", "stepping.c")

@@ -10,8 +10,8 @@ import casadi as ca
 
 from ...blocks.core import Layout
 from .c_code import expand_scalar, to_symbols
-from .entries import Entry, layout
 from .model_spec import ModelSpec
+from .variable_entries import Entry, layout
 
 # Operations whose derivative is zero almost everywhere: with them, a constant derivative means no linear equation.
 _STEP_LIKE = {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_SIGN, ca.OP_COPYSIGN, ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_IF_ELSE_ZERO}

@@ -35,9 +35,9 @@ from .loop_spec import LoopSpec, write_unit
 from .model_description import describe_model
 from .model_spec import ModelSpec
 from .scalars import scalarize
+from .xml_elements import package_version
 from .xml_fmi2 import write_description2
 from .xml_fmi3 import build_description, write_description3
-from .xml_text import package_version
 
 OTHER_FOLDER = "Name another folder."
 """Step where an FMU can't be written where its user wants it."""
@@ -98,7 +98,7 @@ def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
         "c_text",
         "dependencies",
         "elementary_tables",
-        "entries",
+        "variable_entries",
         "html_page",
         "model_description",
         "fmu_package",
@@ -106,7 +106,7 @@ def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
         "scalars",
         "xml_fmi2",
         "xml_fmi3",
-        "xml_text",
+        "xml_elements",
     ]
     if isinstance(spec, LoopSpec):
         written += [

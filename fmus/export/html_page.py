@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block
-from .entries import Entry, layout
 from .equation_text import equations, number
 from .model_spec import ModelSpec, Variable
 from .scalars import scalarize
+from .variable_entries import Entry, layout
 
 _STYLE = """
 :root { color-scheme: light dark; }

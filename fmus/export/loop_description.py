@@ -5,11 +5,11 @@ from __future__ import annotations
 from html import escape
 
 from .dependencies import Dependency
-from .entries import Entry
 from .html_page import page_of
 from .loop_entries import OfferedClock, loop_layout, loop_rows, offered_clocks
 from .loop_spec import LoopSpec, Placed
 from .model_description import Attributes, DescribedVariable, ModelDescription, Unknown
+from .variable_entries import Entry
 
 _VECTOR_OF = {"fixed": "p", "tunable": "p", "input": "w", "state": "x", "discrete": "x"}
 """Vector that a known is in, by its kind."""

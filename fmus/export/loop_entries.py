@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from .entries import Entry, Kind, place_entries, rate_variable
 from .loop_spec import LoopSpec, Placed
 from .scalars import elements_of
+from .variable_entries import Entry, Kind, place_entries, rate_variable
 
 
 def scalarize_loop(spec: LoopSpec) -> LoopSpec:

@@ -12,9 +12,9 @@ from functools import lru_cache
 from .c_code import OF_FMI, ORDER, start_table, variable_table
 from .c_text import c_array
 from .elementary_tables import read_runtime
-from .entries import Entry
 from .loop_entries import loop_layout, loop_rows, offered_clocks
 from .loop_spec import LoopSpec, Placed, write_unit
+from .variable_entries import Entry
 
 _COMMON = ("model.h", "core.c", "loop.c")
 RUNTIME = {fmi: (*_COMMON, *files) for fmi, files in OF_FMI.items()}

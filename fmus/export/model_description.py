@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from .dependencies import Dependency, dependencies, reinitialized_states
-from .entries import Entry, layout
 from .model_spec import ModelSpec, naming_convention
 from .quantities import quantity, type_names
-from .xml_text import element, package_version, unit_element
+from .variable_entries import Entry, layout
+from .xml_elements import element, package_version, unit_element
 
 Attributes = Mapping[str, object]
 _CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}

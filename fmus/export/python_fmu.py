@@ -40,7 +40,7 @@ from .fmu_package import file_for, write_atomically, zip_files
 from .from_block import parameter_spec
 from .html_page import block_text
 from .model_spec import check_file_name
-from .xml_text import package_version, unit_element
+from .xml_elements import package_version, unit_element
 
 NEEDS = "Needs Python where it runs, with NumPy and Loopwright {version}: its equations are Python code."
 """Sentence at the end of such an FMU's description."""

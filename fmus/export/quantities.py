@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ...blocks.core import parse_unit
-from .entries import Entry
+from .variable_entries import Entry
 
 _QUANTITIES = {
     "1": "Number",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from .model_description import DescribedVariable, ModelDescription, Unknown
-from .xml_text import document, element
+from .xml_elements import document, element
 
 
 def write_description2(about: ModelDescription) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .model_description import DescribedVariable, ModelDescription, Unknown
-from .xml_text import document, element
+from .xml_elements import document, element
 
 
 def write_description3(about: ModelDescription) -> str:

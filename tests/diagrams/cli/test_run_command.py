@@ -16,7 +16,7 @@ import pytest
 from loopwright.blocks import OptionError, PathDomainError
 from loopwright.diagrams import Interrupted, experiments
 from loopwright.diagrams.cli import run_experiments as _experiments
-from loopwright.diagrams.cli.arguments import parse_value
+from loopwright.diagrams.cli.command_arguments import parse_value
 from loopwright.diagrams.cli.command_line import main, make_parser
 from loopwright.diagrams.paper.experiment_figures import plot_experiment, plot_path
 from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers

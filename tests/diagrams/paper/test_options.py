@@ -12,8 +12,8 @@ import pytest
 
 from loopwright.blocks import OptionError
 from loopwright.diagrams import experiments
-from loopwright.diagrams.cli import experiment_options as _cli_options
-from loopwright.diagrams.cli.arguments import parse_value
+from loopwright.diagrams.cli import options_of_experiments as _cli_options
+from loopwright.diagrams.cli.command_arguments import parse_value
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.paper.experiment_options import LIMITS
 from loopwright.diagrams.paper.experiments import EXPERIMENTS, compliance, force_tracking, path_following

@@ -17,7 +17,7 @@ from .transfer import Transfer, is_kept
 _SET = ("parameter", "input", "structuralParameter")
 
 
-class StartValues:
+class InstanceStart:
     """Start values of an instance, by functions that set and read its variables.
 
     Attributes

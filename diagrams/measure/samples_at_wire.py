@@ -11,7 +11,7 @@ from ..linearization import Tap, ticks_between_renewals, ticks_to_renewal
 
 
 @dataclass(frozen=True)
-class Samples:
+class SamplesAtWire:
     """Samples, from one to the next of which a test signal is held where anything is sampled."""
 
     every: int  # ticks in a sample
@@ -21,7 +21,7 @@ class Samples:
     held: tuple[Fraction, Fraction] | None = None  # period of the test signal and its first time, where it is held
 
     @classmethod
-    def of(cls, flat: FlatDiagram, signal: Tap, tick: int, *, each_renewal: bool = False) -> Samples:
+    def of(cls, flat: FlatDiagram, signal: Tap, tick: int, *, each_renewal: bool = False) -> SamplesAtWire:
         """Return the samples at a wire of a sampled diagram from a tick on: one in the period of all clocks.
 
         They begin where the wire is renewed, as for its loop's linear model. With ``each_renewal`` they are from one

@@ -10,7 +10,7 @@ from typing import Any
 
 from ...blocks.core import OptionError, near
 from ..paper import DEFAULTS, EXPERIMENTS
-from .arguments import parse_pairs, parse_value
+from .command_arguments import parse_pairs, parse_value
 from .text import say
 
 
