@@ -91,34 +91,8 @@ def _text(value: Any) -> str:
 
 
 def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
-    """Return the text of the modules that write the files, so that a change of them builds again."""
-    folder = Path(__file__).parent
-    written = [
-        "c_code",
-        "c_text",
-        "dependencies",
-        "elementary_tables",
-        "variable_entries",
-        "html_page",
-        "model_description",
-        "fmu_package",
-        "quantities",
-        "scalars",
-        "xml_fmi2",
-        "xml_fmi3",
-        "xml_elements",
-    ]
-    if isinstance(spec, LoopSpec):
-        written += [
-            "loop_description",
-            "loop_entries",
-            "loop_fmu",
-            "loop_memory",
-            "loop_spec",
-            "merged_plants",
-            "own_sources",
-        ]
-    modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
+    """Return the text of this sub-package and of the C of an FMU, so that a change of them builds again."""
+    modules = [file.read_text(encoding="utf-8") for file in sorted(Path(__file__).parent.glob("*.py"))]
     unit = [write_unit(spec)] if isinstance(spec, LoopSpec) else []
     return [package_version(), *(text for _, text in sorted(_runtime_of(spec, fmi).items())), *modules, *unit]
 
