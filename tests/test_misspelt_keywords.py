@@ -112,6 +112,7 @@ HANDED_ON = {
     "Output.__init__": (lambda: (Output, {}), "unit minimum"),
     "State.__init__": (lambda: (State, {}), "unit minimum"),
     "Requirements.__init__": (lambda: (Requirements, {"ms": 2.0}), "loops disk_margin"),
+    "Subsystem.__init__": (lambda: (type(controller), {"function": lambda error: error}), "sample_time delay"),
     "Subsystem.__call__": (lambda: (controller, {}), "error"),
     "Subsystem.replace": (lambda: (controller.replace, {}), "sample_time"),
     "Diagram.report": (lambda: (drive().report, {}), "requirements path worst_case"),

@@ -58,7 +58,7 @@ class Port:
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name  # checked by check_port_names: Python would wrap an error raised here in a RuntimeError
 
-    def is_of(self, block: Any) -> bool:
+    def _is_of(self, block: Any) -> bool:
         """Whether a block of the class has the port, with its parameters; see ``only_if``."""
         if self.only_if is None:
             return True
@@ -140,7 +140,7 @@ class DeclaredPorts:
     def __get__(self, block: Any, owner: type | None = None) -> Mapping[str, Any]:
         if block is None:
             return self.declared
-        return {name: port for name, port in self.declared.items() if port.is_of(block)}
+        return {name: port for name, port in self.declared.items() if port._is_of(block)}
 
 
 @explain_calls
@@ -235,7 +235,7 @@ class Output(Port):
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None:
             return self
-        if not self.is_of(instance):
+        if not self._is_of(instance):
             raise self._absence(instance)
         return Signal(instance, self.name)
 
@@ -297,7 +297,7 @@ class State(Port):
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None:
             return self
-        if self.output and self.is_of(instance):
+        if self.output and self._is_of(instance):
             return Signal(instance, self.name)
         if self.output:
             raise self._absence(instance)

@@ -130,7 +130,10 @@ def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
             f"found the sample time {value!r}; expected seconds, such as 1e-3.", block=block
         ) from None
     if float(value) <= 0:
-        raise SampleTimeError(f"found a sample time of {float(value):g} s; expected a positive one.", block=block)
+        raise SampleTimeError(
+            f"found a sample time of {float(value):g} s; expected a positive one. Give seconds, such as 1e-3.",
+            block=block,
+        )
     if time is None:
         raise SampleTimeError(
             f"found a sample time of {float(value)!r} s, which is neither a multiple of 1 ns nor a fraction with a "

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.diagrams.drawing import shapes, svg
+from loopwright.diagrams.drawing import diagram_picture, shapes
 from loopwright.diagrams.plotting import COLORS, DARK, STONE
 from loopwright.diagrams.plotting.style import STYLE
 from loopwright.diagrams.report import pages
@@ -61,7 +61,7 @@ def test_every_color_of_a_page_is_one_of_the_named_ones():
 
 
 def test_texts_of_figures_and_drawings_can_be_read():
-    grounds = ("#ffffff", shapes.PLANT, "#f5f6f7", *svg.TINTS)
+    grounds = ("#ffffff", shapes.PLANT, "#f5f6f7", *diagram_picture.TINTS)
     for color in (shapes.INK, shapes.NAME, shapes.GREY):
         assert all(contrast(color, on) >= TEXT for on in grounds), color
     for color in (DARK, STONE, STYLE["xtick.color"], STYLE["ytick.color"]):

@@ -49,7 +49,7 @@ def test_a_run_of_a_sweep_calls_few_functions_of_python_and_none_for_each_tick(d
                 worker.run(sample)
             found[ticks] = count_calls(worker, last)
     assert found[2] == found[500]
-    assert found[2] < 410  # 960, and one a tick, where start values, columns and ticks are looked up in every run
+    assert found[2] < 450  # 960, and one a tick, where start values, columns and ticks are looked up in every run
 
 
 def test_start_values_are_set_in_one_call_and_a_run_of_others_is_a_single_run(diagram):
