@@ -242,6 +242,8 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
             raise error(repr(value), "an integer")
         result: Any = int(value)
+    elif numeric and not array and "bool" not in kinds and isinstance(value, bool | np.bool_):
+        raise error(repr(value), "a number")
     elif numeric and not isinstance(value, str | Value):
         try:
             result = np.array(value, dtype=float)

@@ -87,8 +87,8 @@ def _wrong(
                 name, name
             )
             outside = block.in_model_exchange and name in block.outputs
-            hint = f"{_out_of_an_fmu(flat, path, name)} " if outside else ""
-            return _non_finite(path, what, made[name], f"{hint}{inputs_text(shaped)}")
+            hint = _out_of_an_fmu(flat, path, name) if outside else "Samples until then are in error.run."
+            return _non_finite(path, what, made[name], f"{inputs_text(shaped)} {hint}")
     return None
 
 

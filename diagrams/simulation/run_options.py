@@ -208,7 +208,11 @@ def ticks_in(duration: Any, base: Fraction, name: str) -> tuple[int, Fraction]:
     except (TypeError, ValueError):
         span = math.nan
     if not 0 < span < math.inf or isinstance(duration, str | bool):
-        raise OptionError(f"found a duration of {duration!r}; expected seconds, positive.", block=name, port="duration")
+        raise OptionError(
+            f"found a duration of {duration!r}; expected seconds, positive. Give them, such as 2.0.",
+            block=name,
+            port="duration",
+        )
     return _divide(span, base)
 
 

@@ -336,6 +336,7 @@ def test_an_error_of_a_users_check_names_the_block_by_itself():
     ("make", "text"),
     [
         (lambda: PID(kp=math.nan), "PID.kp: found nan; expected finite numbers. Give kp= as that: proportional gain."),
+        (lambda: PID(kp=True), "PID.kp: found True; expected a number. Give kp= as that: proportional gain."),
         (
             lambda: PT1(time_constant=-1.0),
             "PT1.time_constant: found -1; expected a value above 0 in s. Give time_constant= as that: time constant T.",

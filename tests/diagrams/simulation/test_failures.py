@@ -66,6 +66,7 @@ def test_a_nan_stops_the_run_at_the_first_block_that_made_it():
         "root.y, t = 1.1 s: found [nan]; expected finite numbers. This is the first block"
     )
     assert "u = -0.1" in str(error.value).replace("-0.09999999999999987", "-0.1").replace("-0.1000", "-0.1")
+    assert str(error.value).endswith("Samples until then are in error.run.")
     assert (error.value.block, error.value.port, error.value.t) == ("root", "y", 1.1)
     assert len(error.value.run.t) == 11
     assert error.value.run["after.y"][:3] == pytest.approx([1.0, np.sqrt(0.9), np.sqrt(0.8)], abs=1e-15)

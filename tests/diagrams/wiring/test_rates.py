@@ -108,7 +108,7 @@ def test_a_duration_is_taken_to_the_nearest_tick(duration, ticks):
 
 @pytest.mark.parametrize("duration", ["1", None, float("nan"), float("inf"), 0, -1.0, True, [1.0]])
 def test_what_is_no_duration_is_refused(duration):
-    with pytest.raises(OptionError, match=r"d\.duration: found a duration of .*; expected seconds, positive"):
+    with pytest.raises(OptionError, match=r"d\.duration: found a duration of .*; expected seconds, positive\. Give"):
         Diagram("d", Sine(frequency=1.0)()).simulate(duration, step=0.1, progress=False)
 
 
