@@ -43,62 +43,58 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
     detail = "" if is_contact else result.detail  # a contact's is its environment
     about = f": {detail}" if detail else ""
     by_run = is_contact or is_searched  # or by the injection check
-    known: dict[Reason, tuple[str, str]] = {
-        Reason.UNSTABLE: ("the closed loop is unstable", ""),
-        Reason.WITHIN_TOLERANCE: (f"the limit is within {_interval(number, detail)}", _sharpen(result)),
-        Reason.NO_NUMBER: (
-            f"the report has no such number{f'. {detail}' if detail else ''}",
-            "limit one that report.numbers() has",
-        ),
-        Reason.PERIODIC: (
-            "a wire that is renewed several times in the period has no such number",
-            "limit ms, disk_margin, gain_margin_high or phase_margin_deg",
-        ),
-        Reason.NO_VALUE: (
-            "one of the cases has no such number"
-            if is_searched
-            else f"the number does not exist here{_reason_of(number)}",
-            "limit another one" if result.is_step else "limit another margin, such as disk_margin",
-        ),
-        Reason.NO_UNCERTAINTY: ("the data don't say how uncertain they are", "give their uncertainty"),
-        Reason.NOT_CONFIRMED: ("nothing confirms the number", "limit one that a second computation confirms"),
-        Reason.FINDINGS: (
-            f"the linear model leaves something out (†){_finding_of(number)}",
-            "limit a step response, which the run decides, or give the loop as measured",
-        ),
-        Reason.SEVERAL_CUTS: (
-            f"several blocks on the wire may be the plant, and it depends on where it is cut: {detail}",
-            "name the plant's inputs as to=… in the requirements' loops, or to=[] for all blocks together",
-        ),
-        Reason.REFUTED: (
-            f"the {'nonlinear run' if by_run else 'injection check'} contradicts the linear model",
-            "the run counts: look at it" if by_run else "limit a step response, which the run decides",
-        ),
-        Reason.NOT_MEASURED: (
-            f"no response was measured{about}",
-            "" if detail else "name a step's input and output, one entry each",
-        ),
-        Reason.SIZE_NOT_GIVEN: (
-            f"the response to a small step is not that of the linear model: {detail}",
-            "give the size for which the limit holds, size=…",
-        ),
-        Reason.DIVERGES: (f"the response diverges{about}", "give a smaller size, or the actuator more room"),
-        Reason.OSCILLATES: (
-            f"the response keeps oscillating{about}",
-            "give a size of which 2 % are more than that, or make quanta or friction on the loop smaller",
-        ),
-        Reason.NOT_SETTLED: (f"the response has not settled in its record of {detail}", "give a longer length"),
-        Reason.MOVING: (
-            f"the operating point moves{f' ({detail})' if detail else ''}",
-            f"give one at rest, such as at={'lambda d: d.trim(…)' if is_searched else 'diagram.trim(…)'}",
-        ),
-        Reason.ON_THE_LIMIT: (
-            f"a pole lies on the limit of stability{about}",
-            "feed it back, or take it out: the chapter on poles names it",
-        ),
-        Reason.NOT_ANALYSED: (f"not analysed{about}", "" if detail else "the diagram as it is has to be analysed"),
-    }
-    return known[result.reason]
+    match result.reason:
+        case Reason.UNSTABLE:
+            return "the closed loop is unstable", ""
+        case Reason.WITHIN_TOLERANCE:
+            return f"the limit is within {_interval(number, detail)}", _sharpen(result)
+        case Reason.NO_NUMBER:
+            why = f"the report has no such number{f'. {detail}' if detail else ''}"
+            return why, "limit one that report.numbers() has"
+        case Reason.PERIODIC:
+            why = "a wire that is renewed several times in the period has no such number"
+            return why, "limit ms, disk_margin, gain_margin_high or phase_margin_deg"
+        case Reason.NO_VALUE:
+            step = "limit another one" if result.is_step else "limit another margin, such as disk_margin"
+            if is_searched:
+                return "one of the cases has no such number", step
+            return f"the number does not exist here{_reason_of(number)}", step
+        case Reason.NO_UNCERTAINTY:
+            return "the data don't say how uncertain they are", "give their uncertainty"
+        case Reason.NOT_CONFIRMED:
+            return "nothing confirms the number", "limit one that a second computation confirms"
+        case Reason.FINDINGS:
+            why = f"the linear model leaves something out (†){_finding_of(number)}"
+            return why, "limit a step response, which the run decides, or give the loop as measured"
+        case Reason.SEVERAL_CUTS:
+            why = f"several blocks on the wire may be the plant, and it depends on where it is cut: {detail}"
+            step = "name the plant's inputs as to=… in the requirements' loops, or to=[] for all blocks together"
+            return why, step
+        case Reason.REFUTED:
+            why = f"the {'nonlinear run' if by_run else 'injection check'} contradicts the linear model"
+            return why, "the run counts: look at it" if by_run else "limit a step response, which the run decides"
+        case Reason.NOT_MEASURED:
+            step = "" if detail else "name a step's input and output, one entry each"
+            return f"no response was measured{about}", step
+        case Reason.SIZE_NOT_GIVEN:
+            why = f"the response to a small step is not that of the linear model: {detail}"
+            return why, "give the size for which the limit holds, size=…"
+        case Reason.DIVERGES:
+            return f"the response diverges{about}", "give a smaller size, or the actuator more room"
+        case Reason.OSCILLATES:
+            step = "give a size of which 2 % are more than that, or make quanta or friction on the loop smaller"
+            return f"the response keeps oscillating{about}", step
+        case Reason.NOT_SETTLED:
+            return f"the response has not settled in its record of {detail}", "give a longer length"
+        case Reason.MOVING:
+            at = "lambda d: d.trim(…)" if is_searched else "diagram.trim(…)"
+            return f"the operating point moves{f' ({detail})' if detail else ''}", f"give one at rest, such as at={at}"
+        case Reason.ON_THE_LIMIT:
+            step = "feed it back, or take it out: the chapter on poles names it"
+            return f"a pole lies on the limit of stability{about}", step
+        case Reason.NOT_ANALYSED:
+            return f"not analysed{about}", "" if detail else "the diagram as it is has to be analysed"
+    raise AssertionError(f"{result.reason!r} decides, and explains nothing")
 
 
 def _interval(number: Number | None, detail: str) -> str:
