@@ -55,7 +55,7 @@ def main() -> None:
     """Print one row for each chain."""
     text = prepare_functions(" ".join(f"{name}(x)" for name in CHAINS)) + restore_functions()
     text += "".join(CHAIN.format(name, of) for name in CHAINS for of in ("lw_", ""))
-    runtime = (resources.files(export) / "runtime" / "elementary.c").read_text("utf-8")
+    runtime = (resources.files(export) / "fmu_sources" / "elementary.c").read_text("utf-8")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         out = Path(folder) / "chains.so"
         compile_shared({"all.c": text, "elementary.c": runtime}, out, compiled=["all.c"])

@@ -15,6 +15,7 @@ from .archive import ArchiveLimits, read_description
 from .calls import StepOptions, StepTime
 from .checks import doctor
 from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec, tune
+from .fmu_block import Fmu
 from .isolation import Isolation
 from .models import (
     bouncing_ball,
@@ -26,7 +27,6 @@ from .models import (
     mass_spring_damper,
     scara,
 )
-from .running import Fmu
 
 __all__ = [
     "ArchiveLimits",

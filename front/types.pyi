@@ -44,7 +44,7 @@ from .fmus.archive import FmuDescription, FmuFault, FmuFinding, FmuSeverity, Fmu
 from .fmus.calls import FmuInstance, FmuState
 from .fmus.checks import FmuDiagnosis, FmuTrial, FmuVerdict
 from .fmus.export import ProcessorMeasurement, TargetCode, TargetMeasurement, TickFacts
-from .fmus.running import FmuLinearization
+from .fmus.fmu_block import FmuLinearization
 
 __all__ = [
     "ApproximateDelay",

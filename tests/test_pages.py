@@ -137,7 +137,7 @@ TESTED_ELSEWHERE = {
     "howto/export",  # below
     "howto/frequency",
     "reference/blocks",  # tests/diagrams/contract
-    "reference/fmus",  # tests/fmus/running
+    "reference/fmus",  # tests/fmus/fmu_block
 }
 PAGES = sorted(
     page.relative_to(ROOT / "docs").with_suffix("").as_posix()

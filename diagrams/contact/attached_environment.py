@@ -19,7 +19,7 @@ import numpy as np
 
 from ...blocks import Constant, Hold, Step
 from ...blocks.core import AlgebraicLoopError, Array, Block, Input, OptionError, Output, State, parameter
-from ...fmus.running import Fmu
+from ...fmus.fmu_block import Fmu
 from ..linearization import PlantEquations
 from ..wiring import Structure, SubsystemSettings, Wire
 from .contact_ports import Ports

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import ConfirmationError, OptionError, accepts, explain_calls, kinds, near
-from ...fmus.running import Fmu
+from ...fmus.fmu_block import Fmu
 from ..linearization import PlantEquations, copy_point, find_signal, hold_sources, linearize, linearize_plant
 from ..simulation import RunOptions, simulate
 from .attached_environment import attach_environment

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks import AdmittanceFilter, ForceProjection, PathProjection
 from ...blocks.core import Array, Finding, OptionError, UnknownNameError, accepts, brief, explain_calls, kinds
-from ...fmus.running import Derivation
+from ...fmus.fmu_block import Derivation
 from ..linearization import check_options, operating_point
 from .admittance import ContactAdmittance, compute_admittance
 from .contact_loop import close_loop, join_environment

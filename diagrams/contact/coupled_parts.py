@@ -26,7 +26,7 @@ from ...blocks.core import (
     ParameterError,
     ShapeError,
 )
-from ...fmus.running import Derivation
+from ...fmus.fmu_block import Derivation
 from ..frequency import FourMatrices
 from ..linearization import (
     BlockFinding,

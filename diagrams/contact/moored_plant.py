@@ -16,8 +16,8 @@ import numpy as np
 from ...blocks import Hold, Sum
 from ...blocks.core import Array, Block, OptionError, Output, parameter
 from ...fmus.export import build
+from ...fmus.fmu_block import Fmu
 from ...fmus.models import gantry, gantry_elastic, gantry_stiction, scara
-from ...fmus.running import Fmu
 from ..wiring import Structure, Wire
 
 if TYPE_CHECKING:

@@ -42,7 +42,7 @@ INLINE int ${name}_rate(const $name *self, double at, const vec *x, vec *f) {
 }
 
 $methods
-/* A step of the integrator of the FMU, as in export/runtime/integrators.c. */
+/* A step of the integrator of the FMU, as in fmus/export/fmu_sources/integrators.c. */
 INLINE void ${name}_rk4(const $name *self, double now, double h, vec *x) {
     vec k1[AT_LEAST_1($n_k)], k2[AT_LEAST_1($n_k)], k3[AT_LEAST_1($n_k)], k4[AT_LEAST_1($n_k)], stage[AT_LEAST_1($n_x)];
     memcpy(stage, x, sizeof stage);

@@ -23,7 +23,7 @@ typedef struct {
     double *room;                  /* vectors: memory of large diagrams */
 } lanes;
 
-/* Substeps of at most `step` in h, as in runtime/integrators.c. */
+/* Substeps of at most `step` in h, as in fmus/export/fmu_sources/integrators.c. */
 static inline int64_t substeps(double h, double step) {
     double count = ceil(h / step - 1e-9);
     return count < 1.0 ? 1 : (int64_t)count;

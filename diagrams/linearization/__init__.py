@@ -7,7 +7,7 @@ and in `model_at`, which makes the linear models:
   (`block_slopes`), with its kinks (`kinks`) and the mean slopes of its stairs (`mean_stairs`);
 - FMUs in model exchange: the evaluators of those functions (`exchanged`);
 - FMUs that step: their equations, differences of their steps, or models identified from responses (`plant_models`,
-  `identification`), by `fmus.running`; with a coupling that acts within a step `coupled_chain`;
+  `identification`), by `fmus.fmu_block`; with a coupling that acts within a step `coupled_chain`;
 - transport delays: channels around a continuous model (`flow_model`), signals of the past in a sampled one
   (`delayed_flow`);
 - parameters: slopes that travel with every number (`derivatives_along`); of start values of FMUs differences of whole

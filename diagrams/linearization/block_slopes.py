@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import Block, Layout
 from ...blocks.tracing import NEXT, Traced, has_large_product, size
-from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization
+from ...fmus.fmu_block import Derivation, DerivativeMethod, FmuLinearization
 
 BRANCHES = frozenset(
     {

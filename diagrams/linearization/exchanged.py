@@ -12,7 +12,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ...blocks.core import Finding, FmuError, Layout
-from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization, check_exchange_slopes, find_exchange_slopes
+from ...fmus.fmu_block import (
+    Derivation,
+    DerivativeMethod,
+    FmuLinearization,
+    check_exchange_slopes,
+    find_exchange_slopes,
+)
 from ..flat import Evaluators, FlatDiagram
 from ..model_exchange import ModelExchangeEvaluator
 from ..results import OperatingPoint
@@ -20,7 +26,7 @@ from ..wiring import join
 from .left_out_effects import CoarseValues, InexactDerivatives, RefutedDerivatives
 
 if TYPE_CHECKING:
-    from ...fmus.running import Fmu
+    from ...fmus.fmu_block import Fmu
 
 
 KEPT = 2**20

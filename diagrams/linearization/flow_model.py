@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...blocks.core import Finding, OptionError, explain_calls, left_of
-from ...fmus.running import Derivation
+from ...fmus.fmu_block import Derivation
 from ..flat import NONE, FlatDiagram, announcers
 from ..frequency import FourMatrices, find_pade_limit, hold_inputs, replace_delays
 from ..results import OperatingPoint

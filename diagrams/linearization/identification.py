@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import FmuError, Layout, identity
-from ...fmus.running import Derivation, DerivativeMethod, RestoredPoint, open_to_step, setup_of, take_step
+from ...fmus.fmu_block import Derivation, DerivativeMethod, RestoredPoint, open_to_step, setup_of, take_step
 
 if TYPE_CHECKING:
-    from ...fmus.running import Fmu
+    from ...fmus.fmu_block import Fmu
 
 SAMPLES = 1000
 """Steps of a response."""

@@ -26,7 +26,7 @@ import numpy as np
 
 from ...blocks.core import Block, Finding, Output, State
 from ...fmus.calls import is_smooth
-from ...fmus.running import Fmu
+from ...fmus.fmu_block import Fmu
 from ..flat import FlatDiagram, WiredDiagram, just_after
 from ..results import OperatingPoint
 from ..wiring import join

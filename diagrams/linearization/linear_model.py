@@ -37,7 +37,7 @@ from ...blocks.core import (
     kinds,
     missing_member,
 )
-from ...fmus.running import Derivation, DerivativeMethod
+from ...fmus.fmu_block import Derivation, DerivativeMethod
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..frequency import (
     NEUTRAL,

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from ...blocks.core import Block, FmuError, Layout, LoopwrightError, OptionError, ParameterError, kinds
+from ...fmus.fmu_block import Derivation, FmuLinearization, linearize_fmu, step_gap
 from ...fmus.platform import is_built_here
-from ...fmus.running import Derivation, FmuLinearization, linearize_fmu, step_gap
 from ..flat import FlatDiagram, StateLayout, WiredDiagram
 from ..frequency import hold_inputs
 from ..results import OperatingPoint
@@ -23,7 +23,7 @@ from .exchanged import linearize_exchanged
 from .identification import identify_step
 
 if TYPE_CHECKING:
-    from ...fmus.running import Fmu
+    from ...fmus.fmu_block import Fmu
 
 A_WAY = kinds.one_of("equations", "step", "identified").worded(
     "one of 'equations', 'step', 'identified', or None", found=kinds.by_name

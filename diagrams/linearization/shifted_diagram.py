@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuError, Layout, LoopwrightError
+from ...fmus.fmu_block import take_shifted_steps
 from ...fmus.platform import is_built_here
-from ...fmus.running import take_shifted_steps
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import Wire, join

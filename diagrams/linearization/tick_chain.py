@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Finding, Layout, OptionError
-from ...fmus.running import Derivation
+from ...fmus.fmu_block import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..frequency import FourMatrices
 from ..results import OperatingPoint

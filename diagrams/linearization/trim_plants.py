@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ...blocks.core import FmuError, SimulationError, elements
-from ...fmus.running import FmuLinearization, linearize_fmu
+from ...fmus.fmu_block import FmuLinearization, linearize_fmu
 from ..flat import Evaluators, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import change_parameter, join
@@ -20,7 +20,7 @@ from .identification import WATCHED, output_drift
 from .plant_models import PlantModel, join_matrices, plant_entries, plant_layout, plant_model, plant_point
 
 if TYPE_CHECKING:
-    from ...fmus.running import Fmu
+    from ...fmus.fmu_block import Fmu
     from .trim_request import Free
 
 

@@ -17,7 +17,7 @@ from .plant_models import plant_layout
 from .taps import find_signal
 
 if TYPE_CHECKING:
-    from ...fmus.running import Fmu
+    from ...fmus.fmu_block import Fmu
 
 WHOLE = 1e-10
 """Distance from a whole number up to which a slope is one."""

@@ -21,8 +21,8 @@ from ...blocks import (
     UnitDelay,
 )
 from ...blocks.core import LoopwrightError, OptionError
+from ...fmus.fmu_block import Fmu
 from ...fmus.models import Gantry
-from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..report import IN_MODEL_EXCHANGE, Basis, Case, Implementation, InjectionPlan, Texts, Variant, point_of
 from ..results import OperatingPoint

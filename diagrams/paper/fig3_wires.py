@@ -27,8 +27,8 @@ from ...blocks import (
 )
 from ...blocks.core import Input, Output, ShapeError, UnknownNameError, explain_calls
 from ...fmus import Fmu
+from ...fmus.fmu_block import suggest_names
 from ...fmus.models import gantry
-from ...fmus.running import suggest_names
 from ..wiring import subsystem
 
 POLES_PAR, POLES_PERP = (-20.0,) * 3, (-40.0,) * 3

@@ -20,11 +20,11 @@ import numpy as np
 from ...blocks import PlanarModel
 from ...blocks.core import Array, Layout, LoopwrightError, ParameterError
 from ...blocks.path_following import PlanarSlopes, planar_slopes
-from ...fmus.running import FmuLinearization
+from ...fmus.fmu_block import FmuLinearization
 from ..linearization import linearize_block, operating_point
 
 if TYPE_CHECKING:
-    from ...fmus.running import Fmu
+    from ...fmus.fmu_block import Fmu
     from ..flat import WiredDiagram
     from ..results import OperatingPoint
 

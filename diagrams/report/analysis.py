@@ -9,7 +9,7 @@ from functools import wraps
 from typing import Any, TypeVar
 
 from ...blocks.core import Kind, OptionError, accepts, kinds, offer_elsewhere, on_one_thread
-from ...fmus.running import Fmu
+from ...fmus.fmu_block import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
 from ..plotting import AxisUnits

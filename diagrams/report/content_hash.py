@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block
-from ...fmus.running import Fmu
+from ...fmus.fmu_block import Fmu
 from ..flat import WiredDiagram
 
 

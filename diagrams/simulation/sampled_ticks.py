@@ -33,7 +33,7 @@ from .ticks_in_c import WISHED, TicksInC
 from .workspace import Workspace
 
 if TYPE_CHECKING:
-    from ...fmus.running import Fmu
+    from ...fmus.fmu_block import Fmu
 
 _WINDOW, _FEW = 2**14, 16
 """Ticks whose times are computed at a time, at most; so many are computed without arrays, whose set-up takes longer."""
@@ -189,7 +189,7 @@ class SampledTicks(TicksInC[CompiledLoop]):
 
 def _find_fused(flat: FlatDiagram, plants: PlantsInC) -> dict[str, FusedPlant]:
     """Return by path how a fused loop steps each plant: by the equations of its FMU, or by the FMU's functions."""
-    from ...fmus.running import Fmu  # only such a run needs the block
+    from ...fmus.fmu_block import Fmu  # only such a run needs the block
 
     found = {}
     for path, plant in plants.entries.items():

@@ -8,8 +8,8 @@ from typing import Any
 
 from ...blocks.core import OptionError
 from ...fmus import Fmu
+from ...fmus.fmu_block import setup_of
 from ...fmus.platform import is_built_here
-from ...fmus.running import setup_of
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import RecordedSignals, Run, machine_memory
 from ..simulation import RunOptions, Simulation

@@ -15,8 +15,8 @@ import numpy as np
 
 from ...blocks.core import FmuEnd, FmuFileError, FmuProcessError, LoopwrightError, Wanted
 from ..archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuSeverity
+from ..fmu_block import Fmu
 from ..isolation import Isolation
-from ..running import Fmu
 from .summary import INTERFACES
 
 PATIENCE = 120.0

@@ -1,8 +1,8 @@
 """C code of a model: CasADi writes the equations, this module the tables around them.
 
-The generated ``model.c`` is the only file to compile: it includes the runtime (``runtime/``, and the files of
-`loopwright.fmus.runtime` that runs of diagrams use, too), so that the compiler inlines the equations into the
-integrator.
+The generated ``model.c`` is the only file to compile: it includes the C sources of every FMU (``fmu_sources/``, and
+the files of `loopwright.fmus.runtime` that runs of diagrams use, too), so that the compiler inlines the equations into
+the integrator.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ OF_FMI = {
     2: ("fmi_calls.c", "fmi2.c", "fmi2_refused.c"),
 }
 """Files with FMI's functions, by version."""
-RUNTIME = {fmi: (*_COMMON, *files) for fmi, files in OF_FMI.items()}
+FILES = {fmi: (*_COMMON, *files) for fmi, files in OF_FMI.items()}
 ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
 
 # Longest function that is expanded; beyond it, calls of shared functions keep the code small (compile time grows fast).
@@ -139,7 +139,7 @@ def _number(value: float | None, missing: str) -> str:
 
 
 def variable_table(entries: Iterable[Entry]) -> str:
-    """Return the C table of variables, see ``runtime/model.h``."""
+    """Return the C table of variables, see ``fmu_sources/model.h``."""
     rows = []
     for e in entries:
         low, high = _number(e.variable.minimum, "-INFINITY"), _number(e.variable.maximum, "INFINITY")
@@ -202,7 +202,7 @@ def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
     """Return the text of ``model.c``.
 
     ``token``: the instantiation token (FMI 3.0, 2.3.1).
-    Returns: the C text; it includes the files of `runtime`.
+    Returns: the C text; it includes the files of `read_fmu_sources`.
     Returns: whether there are directional and adjoint derivatives.
     """
     entries = layout(spec)
@@ -217,14 +217,14 @@ def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
         variable_table(entries),
         start_table(entries),
         *_tables(spec, equations.nonzeros),
-        "".join(f'#include "{name}"\n' for name in RUNTIME[fmi][2:]),
+        "".join(f'#include "{name}"\n' for name in FILES[fmi][2:]),
     ]
     return "\n".join(parts), equations.nonzeros is not None
 
 
 @lru_cache(maxsize=2)
-def runtime(fmi: int = 3) -> dict[str, str]:
-    """Return the text of the C runtime's files for a version of FMI, by name."""
-    folder = resources.files(__package__) / "runtime"
-    own = {name: (folder / name).read_text(encoding="utf-8") for name in RUNTIME[fmi]}
+def read_fmu_sources(fmi: int = 3) -> dict[str, str]:
+    """Return the texts of the C sources of an FMU for a version of FMI, by name."""
+    folder = resources.files(__package__) / "fmu_sources"
+    own = {name: (folder / name).read_text(encoding="utf-8") for name in FILES[fmi]}
     return own | {name: f"{read_sources(name)}\n" for name in _SHARED}

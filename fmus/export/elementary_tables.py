@@ -1,8 +1,8 @@
 """Tables of the elementary functions in exported FMUs, computed in decimal arithmetic: no platform's function is asked.
 
-The functions themselves are in ``runtime/elementary.c``, those of single precision in ``runtime/elementary_single.c``.
-The equations of a generated ``model.c`` call them under
-their own names, so that an FMU computes the same bits on every platform.
+The functions themselves are in ``fmu_sources/elementary.c``, those of single precision in
+``fmu_sources/elementary_single.c``. The equations of a generated ``model.c`` call them under their own names, so that
+an FMU computes the same bits on every platform.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _DIGITS = 60
 _PER_LINE = 6
 
 
-def read_runtime(name: str) -> str:
-    """Return the text of a C file of ``runtime/``."""
-    return (resources.files(__package__) / "runtime" / name).read_text(encoding="utf-8")
+def read_fmu_source(name: str) -> str:
+    """Return the text of a C file of ``fmu_sources/``."""
+    return (resources.files(__package__) / "fmu_sources" / name).read_text(encoding="utf-8")
 
 
 def prepare_functions(equations: str) -> str:

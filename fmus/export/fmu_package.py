@@ -1,6 +1,6 @@
 """Build of an FMU from a model: generate, compile, zip, cache.
 
-The key of a build covers everything that goes into it (equations, variables, runtime, compiler, flags, version), so
+The key of a build covers everything that goes into it (equations, variables, C sources, compiler, flags, version), so
 that the second build of the same model only looks up a file.
 """
 
@@ -25,12 +25,12 @@ from ...blocks.core import FmuError, accepts, explain_calls, explain_disk_errors
 from ..child_processes import temporary_folder
 from ..platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform, record_build
 from ..toolchain import DIAGRAM_FLAGS, SUFFIXES, TARGETS, flags
-from .c_code import generate, runtime
+from .c_code import generate, read_fmu_sources
 from .compiler import Compiler, check_platform, compile_shared, find_compiler
 from .html_page import index_html
 from .loop_description import describe_loop, loop_page
 from .loop_entries import scalarize_loop
-from .loop_fmu import generate_loop, loop_runtime
+from .loop_fmu import generate_loop, read_loop_sources
 from .loop_spec import LoopSpec, write_unit
 from .model_description import describe_model
 from .model_spec import ModelSpec
@@ -94,7 +94,7 @@ def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
     """Return the text of this sub-package and of the C of an FMU, so that a change of them builds again."""
     modules = [file.read_text(encoding="utf-8") for file in sorted(Path(__file__).parent.glob("*.py"))]
     unit = [write_unit(spec)] if isinstance(spec, LoopSpec) else []
-    return [package_version(), *(text for _, text in sorted(_runtime_of(spec, fmi).items())), *modules, *unit]
+    return [package_version(), *(text for _, text in sorted(_sources_of(spec, fmi).items())), *modules, *unit]
 
 
 def build_key(spec: ModelSpec | LoopSpec, options: Options, compiler: Compiler) -> str:
@@ -143,13 +143,13 @@ def _first_build(platform: str) -> str:
     return {"x86_64-windows": "minutes"}.get(platform, "longer")
 
 
-def _runtime_of(spec: ModelSpec | LoopSpec, fmi: int) -> Mapping[str, str]:
-    return loop_runtime(fmi) if isinstance(spec, LoopSpec) else runtime(fmi)
+def _sources_of(spec: ModelSpec | LoopSpec, fmi: int) -> Mapping[str, str]:
+    return read_loop_sources(fmi) if isinstance(spec, LoopSpec) else read_fmu_sources(fmi)
 
 
 def _archive(spec: ModelSpec | LoopSpec, options: Options, compiler: Compiler, notify: Callable[[str], None]) -> bytes:
     fmi = options.fmi
-    included = _runtime_of(spec, fmi)
+    included = _sources_of(spec, fmi)
     if isinstance(spec, LoopSpec):
         model, about = generate_loop(spec, _TOKEN, fmi), describe_loop(spec, _TOKEN, fmi)
         page = loop_page(spec, options.documentation, fmi=fmi)

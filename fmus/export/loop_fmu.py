@@ -1,7 +1,7 @@
 """C text of the FMU of a diagram: its loop behind FMI's functions.
 
-The functions of FMI are those of exported models (``runtime/fmi3.c``, ``fmi2.c``), for co-simulation alone; behind them
-is the loop of the diagram (``runtime/loop.c``) in place of a model's integrators.
+The functions of FMI are those of exported models (``fmu_sources/fmi3.c``, ``fmi2.c``), for co-simulation alone; behind
+them is the loop of the diagram (``fmu_sources/loop.c``) in place of a model's integrators.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from functools import lru_cache
 
 from .c_code import OF_FMI, ORDER, start_table, variable_table
 from .c_text import c_array
-from .elementary_tables import read_runtime
+from .elementary_tables import read_fmu_source
 from .loop_entries import loop_layout, loop_rows, offered_clocks
 from .loop_spec import LoopSpec, Placed, write_unit
 from .variable_entries import Entry
 
 _COMMON = ("model.h", "core.c", "loop.c")
-RUNTIME = {fmi: (*_COMMON, *files) for fmi, files in OF_FMI.items()}
+_FILES = {fmi: (*_COMMON, *files) for fmi, files in OF_FMI.items()}
 
 
 def generate_loop(spec: LoopSpec, token: str, fmi: int) -> str:
@@ -35,7 +35,7 @@ def generate_loop(spec: LoopSpec, token: str, fmi: int) -> str:
         *_labels(spec),
         c_array("char *const", "lw_clock_names", (f'"{clock.name}"' for clock in clocks)) if clocks else "",
         "static const double lw_nominals[] = {1.0};\n",
-        "".join(f'#include "{name}"\n' for name in RUNTIME[fmi][1:]),
+        "".join(f'#include "{name}"\n' for name in _FILES[fmi][1:]),
     ]
     return "\n".join(parts)
 
@@ -78,7 +78,7 @@ def _places(spec: LoopSpec) -> Iterator[str]:
 
 
 def _code_of(spec: LoopSpec, one: Placed, place: int) -> int:
-    """Return where the value of an output is, as `runtime/loop.c` reads it."""
+    """Return where the value of an output is, as `fmu_sources/loop.c` reads it."""
     return {"x": -1 - place, "w": _logged(spec) + place}.get(one.vector, place)
 
 
@@ -130,6 +130,6 @@ def _labels(spec: LoopSpec) -> Iterator[str]:
 
 
 @lru_cache(maxsize=2)
-def loop_runtime(fmi: int) -> dict[str, str]:
+def read_loop_sources(fmi: int) -> dict[str, str]:
     """Return the text of the files that ``model.c`` of a diagram includes, by name."""
-    return {name: read_runtime(name) for name in RUNTIME[fmi]}
+    return {name: read_fmu_source(name) for name in _FILES[fmi]}

@@ -14,7 +14,7 @@ from typing import Any
 from ...blocks.core import brief, count_of
 from ..runtime import read_sources
 from .c_text import c_number, c_text
-from .elementary_tables import prepare_functions, read_runtime, restore_functions
+from .elementary_tables import prepare_functions, read_fmu_source, restore_functions
 from .loop_memory import LoopMemory
 from .merged_plants import MergedPlant, describe_plants, plant_fields, write_plants
 from .model_spec import Variable
@@ -199,7 +199,7 @@ def write_unit(spec: LoopSpec, *, own_functions: bool = False) -> str:
     """
     code = spec.code
     if own_functions:
-        before = prepare_functions(code).replace('#include "elementary.c"\n', read_runtime("elementary.c"))
+        before = prepare_functions(code).replace('#include "elementary.c"\n', read_fmu_source("elementary.c"))
         code = before + code + restore_functions()
     plants = write_plants(spec.plants)
     return "\n".join([_HEAD, plants, code, read_sources(*_TICKS, *(_BETWEEN if spec.hybrid else ())), *_describe(spec)])

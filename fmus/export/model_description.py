@@ -18,7 +18,7 @@ Attributes = Mapping[str, object]
 _CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}
 _INITIAL = dict.fromkeys(("fixed", "tunable", "state", "discrete"), "exact")
 _INITIAL |= dict.fromkeys(("derivative", "output", "indicator"), "calculated")
-#: Log categories (FMI 3.0, 2.4.5) that the runtime uses.
+#: Log categories (FMI 3.0, 2.4.5) that an exported FMU uses.
 LOG_CATEGORIES = {
     "logStatusWarning": "Warnings",
     "logStatusError": "Errors, with the value found, the value expected, and the next step",

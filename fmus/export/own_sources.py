@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from .c_code import OF_FMI, RUNTIME, runtime
+from .c_code import FILES, OF_FMI, read_fmu_sources
 
 INCLUDE = re.compile(r'^#include "(.*)"$', re.MULTILINE)
 _OURS = re.compile(r"\b(_?(?:lw|LW|casadi|CASADI|eq)_)")
@@ -36,7 +36,7 @@ def read_packed_sources(path: str | os.PathLike[str]) -> dict[str, str]:
 def are_of_this_version(sources: Mapping[str, str]) -> bool:
     """Whether the sources around ``model.c`` are those that this version of Loopwright writes."""
     around = {name: text for name, text in sources.items() if name != "model.c"}
-    return any(around == runtime(fmi) for fmi in RUNTIME)
+    return any(around == read_fmu_sources(fmi) for fmi in FILES)
 
 
 def expand_sources(name: str, sources: dict[str, str], behind: dict[str, str] | None = None) -> str:

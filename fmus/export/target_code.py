@@ -11,7 +11,7 @@ import numpy as np
 from .c_expressions import OF_TIME, NumberText
 from .c_templates import fill_template
 from .c_text import c_constant, fill_lines
-from .elementary_tables import prepare_functions, prepare_single, read_runtime
+from .elementary_tables import prepare_functions, prepare_single, read_fmu_source
 from .model_spec import Variable
 from .scalar_operations import Tables
 from .target_layout import TargetLayout
@@ -222,7 +222,7 @@ def _write_own_functions(single: Sequence[str], double: Sequence[str]) -> str:
     texts = []
     if double:
         text = prepare_functions(" ".join(f"{name}(" for name in double)).replace(
-            '#include "elementary.c"\n', read_runtime("elementary.c")
+            '#include "elementary.c"\n', read_fmu_source("elementary.c")
         )
         text = re.sub(r"^#define (\w+) lw_\1\n", "", text, flags=re.MULTILINE)
         # The same numbers in decimal digits, as in the rest of the source.
@@ -230,7 +230,7 @@ def _write_own_functions(single: Sequence[str], double: Sequence[str]) -> str:
         texts.append(re.sub(r"\b(INFINITY|NAN)\b", r"(double)\1", text))  # they are of single precision in C
     if single:
         texts.append(
-            prepare_single(single).replace('#include "elementary_single.c"\n', read_runtime("elementary_single.c"))
+            prepare_single(single).replace('#include "elementary_single.c"\n', read_fmu_source("elementary_single.c"))
         )
     return _leave_out_unused("\n".join(texts), [*(f"lw_{f}" for f in double), *(f"lw_{f}f" for f in single)])
 

@@ -82,7 +82,7 @@ class WrittenVariable:
     """A variable of an exported FMU.
 
     ``kind``: one of time, fixed, tunable, input, state, discrete, derivative, output, indicator.
-    ``first``, ``size``: its interval among the values of an instance (``runtime/model.h``).
+    ``first``, ``size``: its interval among the values of an instance (``fmu_sources/model.h``).
     """
 
     name: str

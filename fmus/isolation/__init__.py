@@ -1,7 +1,7 @@
 """A child process that holds the library of an FMU: requests, shared memory, watchdog, end."""
 
 from .callbacks import InputLines, log_and_memory
-from .endings import describe_memory
+from .end_reasons import describe_memory
 from .fmu_process import ChildProcess, ChildRequest
 from .pool import count_processes, end_idle, give_back, take
 from .process_limits import Isolation, default_memory

@@ -21,7 +21,7 @@ import numpy as np
 from ...blocks.core import FmuEnd, FmuError, FmuProcessError, describe_disk_error
 from ..child_processes import ProcessGroup, find_python, make_temporary_folder, remove_folder
 from . import wire
-from .endings import copy_files, count_cores, read_end
+from .end_reasons import copy_files, count_cores, read_end
 from .output import ChildOutput
 from .wire import CAUSE, CHILD_SLEEPS, DATA, MAIL, MESSAGES, PARENT_SLEEPS, PLACE, REPLY, REQUEST, SEQUENCE, STATUS
 

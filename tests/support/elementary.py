@@ -14,8 +14,8 @@ from loopwright.fmus.export.elementary_tables import (
     restore_functions,
 )
 
-RUNTIME = resources.files(export) / "runtime" / "elementary.c"
-RUNTIME_SINGLE = resources.files(export) / "runtime" / "elementary_single.c"
+RUNTIME = resources.files(export) / "fmu_sources" / "elementary.c"
+RUNTIME_SINGLE = resources.files(export) / "fmu_sources" / "elementary_single.c"
 ONE_FUNCTION = """
 #ifdef _WIN32
 __declspec(dllexport)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ....blocks.core import BetweenTicksError, LoopwrightError
-from ....fmus.running import DerivativeMethod
+from ....fmus.fmu_block import DerivativeMethod
 from ...flat import WiredDiagram
 from ...frequency import (
     Comparison,

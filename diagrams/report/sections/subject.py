@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ....blocks.core import Block, print_unit
-from ....fmus.running import Fmu
+from ....fmus.fmu_block import Fmu
 from ...frequency import Number
 from ...results import PointOrigin
 from ...wiring import Wire

@@ -37,7 +37,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, NonFiniteError, subsystem
 from loopwright.diagrams.linearization.left_out_effects import EventWithinPeriod, StepsOnly, UnusualStart
-from loopwright.fmus.running.derivation import Derivation, DerivativeMethod
+from loopwright.fmus.fmu_block.derivation import Derivation, DerivativeMethod
 from loopwright.types import Linearization, OperatingPoint
 from support.linear import by_simulation, differences
 

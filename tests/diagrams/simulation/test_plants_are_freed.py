@@ -133,7 +133,7 @@ def test_the_first_plant_too_where_the_second_one_cannot_start(calls, file, monk
 
 def test_after_an_interruption(calls, file, monkeypatch):
     # Ctrl-C within a step of the plant, in the 51st tick
-    from loopwright.fmus.running.fmu import FmuInstance
+    from loopwright.fmus.fmu_block.fmu import FmuInstance
 
     bind = FmuInstance.bind
 

@@ -27,7 +27,7 @@ from loopwright.blocks.core import near, parse_unit
 from loopwright.diagrams import DefinitionError
 from loopwright.diagrams.exporting import make_exported
 from loopwright.fmus import FmuError
-from loopwright.fmus.running.fmu_start_values import check_value
+from loopwright.fmus.fmu_block.fmu_start_values import check_value
 
 
 @subsystem(sample_time=0.01)

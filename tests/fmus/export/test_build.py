@@ -18,7 +18,7 @@ from loopwright.blocks.core.errors import CompilerError, DefinitionError, FmuErr
 from loopwright.fmus import Variable, build_fmu
 from loopwright.fmus.export import compiler as _compiler
 from loopwright.fmus.export import fmu_package as _build
-from loopwright.fmus.export.c_code import runtime
+from loopwright.fmus.export.c_code import read_fmu_sources
 from loopwright.fmus.export.compiler import TARGETS, compile_shared, find_compiler
 from loopwright.fmus.platform import native_platform
 from loopwright.fmus.toolchain import SUFFIXES
@@ -157,7 +157,7 @@ def test_a_failing_compiler_is_quoted(tmp_path):
 
 def test_a_failed_build_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "c"))
-    monkeypatch.setattr(_build, "runtime", lambda fmi: runtime(fmi) | {"core.c": "#error broken"})
+    monkeypatch.setattr(_build, "read_fmu_sources", lambda fmi: read_fmu_sources(fmi) | {"core.c": "#error broken"})
     with pytest.raises(CompilerError, match="broken"):
         build_fmu(mass_spring_damper(), tmp_path / "out.fmu")
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []

@@ -1,4 +1,4 @@
-"""The C runtime under AddressSanitizer and UndefinedBehaviorSanitizer: no report, both versions."""
+"""The C of exported FMUs under AddressSanitizer and UndefinedBehaviorSanitizer: no report, both versions."""
 
 import os
 import shutil

@@ -8,7 +8,7 @@ import pytest
 
 from loopwright.fmus import FmuError
 from loopwright.fmus.export import read_equations, read_own_sources
-from loopwright.fmus.export.c_code import generate, runtime
+from loopwright.fmus.export.c_code import generate, read_fmu_sources
 from loopwright.fmus.export.written_equations import read_text
 from support.exported import mass_spring_damper, pendulums
 
@@ -111,7 +111,7 @@ def test_sources_that_are_none_or_more_than_scalar_operations_are_refused(tmp_pa
 
 def write_sources(path, spec, fmi=3, **changes):
     with zipfile.ZipFile(path, "w") as archive:
-        for name, text in {**runtime(fmi), "model.c": generate(spec, "token", fmi)[0], **changes}.items():
+        for name, text in {**read_fmu_sources(fmi), "model.c": generate(spec, "token", fmi)[0], **changes}.items():
             archive.writestr(f"sources/{name}", text)
 
 

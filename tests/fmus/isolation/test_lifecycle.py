@@ -16,8 +16,8 @@ from loopwright.blocks import PID
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, Isolation
 from loopwright.fmus.calls import FmuInstance, LoadedFmu
+from loopwright.fmus.fmu_block import setup_of
 from loopwright.fmus.isolation import count_processes, end_idle
-from loopwright.fmus.running import setup_of
 from loopwright.frequency import margins
 from support.misstated import misstated_fmu
 from support.waiting import FAR, is_there, wait_for

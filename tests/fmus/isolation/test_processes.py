@@ -17,8 +17,8 @@ from loopwright.blocks import ParameterError
 from loopwright.blocks.core import Wanted
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, FmuProcessError, FmuRuntimeError, Isolation
+from loopwright.fmus.fmu_block import setup_of
 from loopwright.fmus.isolation import count_processes, end_idle
-from loopwright.fmus.running import setup_of
 from loopwright.types import FmuEnd
 from support.exported import mass_spring_damper
 from support.waiting import Interruption, wait_for

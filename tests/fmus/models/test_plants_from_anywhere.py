@@ -33,7 +33,7 @@ def largest_differences(run, other, names):
 SIGNALS = ("eta", "xi", "motor_force", "plant.position", "plant.velocity", "plant.acceleration")
 
 
-@pytest.mark.slow  # the quick set has tests/fmus/running/test_fmi2.py
+@pytest.mark.slow  # the quick set has tests/fmus/fmu_block/test_fmi2.py
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda p: p.__name__.rpartition(".")[2])
 def test_builds_of_both_versions_give_the_same_numbers(plant):
     """The C of a plant is one, whatever its version: not a bit may differ, events and stiff friction included."""

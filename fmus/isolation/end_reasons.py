@@ -1,4 +1,4 @@
-"""Begin and end of a child: the copy of its files, the cores for it, the reason of its end."""
+"""Reasons for the end of a child, from its exit status; and the copy of its files, and the cores for it."""
 
 from __future__ import annotations
 

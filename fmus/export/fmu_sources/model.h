@@ -1,4 +1,4 @@
-/* Runtime of exported FMUs: declarations of a generated model, and of an instance.
+/* C sources of exported FMUs: declarations of a generated model, and of an instance.
  *
  * One translation unit per FMU: the generated model.c defines the LW_ constants below, includes this header, then holds
  * the equations and tables, then includes core.c, integrators.c, events.c and stepping.c (no FMI version in them), fmi_calls.c and the

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from loopwright.blocks import Constant
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu
-from loopwright.fmus.running.difference_quotients import find_slopes
+from loopwright.fmus.fmu_block.difference_quotients import find_slopes
 from loopwright.types import CoarseValues
 from support.closed_form import closed_form_fmu
 

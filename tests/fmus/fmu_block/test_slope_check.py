@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.fmus import FmuError
-from loopwright.fmus.running.slope_check import check_slopes
+from loopwright.fmus.fmu_block.slope_check import check_slopes
 
 
 def check(function, J, at, nominal=1.0, limits=(-np.inf, np.inf)):

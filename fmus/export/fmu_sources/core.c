@@ -1,4 +1,4 @@
-/* Runtime of all FMI versions: logging, variables, equations, derivatives, modes, states.
+/* Common to all FMI versions: logging, variables, equations, derivatives, modes, states.
  *
  * Functions return true on success. Otherwise they have logged the reason, and the instance is terminated until it is
  * reset or a state is restored (in FMI, a function that returns an error leads to Terminated).
