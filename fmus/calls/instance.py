@@ -104,7 +104,7 @@ class FmuInstance(LoadedFmu):
         if not self.is_built_here:
             self.states.close()
         super().reset()
-        self.states.final.value = not self.states.handles  # no earlier state is left to go back to
+        self.states.final.value = not self.states.kept  # no earlier state is left to go back to
         if self._step is not None:
             self._step.forget()
 

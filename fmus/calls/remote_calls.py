@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +121,7 @@ class RemoteCalls(FmiCalls):
 
     def renew(self, log: Log, running: bool) -> None:
         """Free the instance and make another one, to which C in the child is bound, too; see `FmiCalls.renew`."""
+        self._free_states()
         super().renew(log, running)
         self.process.bind_in_c_again()
 
@@ -135,15 +137,25 @@ class RemoteCalls(FmiCalls):
         """Bind functions of the library to their arguments: one round trip runs them all."""
         return RemoteBoundCalls(self.process, calls, self.limits)
 
+    def free_instance(self) -> None:
+        """Free the instance and unload the library."""
+        self._free_states()
+        super().free_instance()
+
     def free_state(self, handle: Any) -> None:
         """Free a saved state before the next one is saved; Python may ask for it at any time, in a step too."""
         self._freed.append(handle)
 
     def save_state(self) -> Any:
         """Return the handle of a copy of the instance's memory, in the child."""
-        while self._freed:
-            super().free_state(self._freed.popleft())
+        self._free_states()
         return super().save_state()
+
+    def _free_states(self) -> None:
+        """Free the states that wait for it, as long as their instance is there."""
+        while self._freed:
+            with suppress(call_error_type()):
+                super().free_state(self._freed.popleft())
 
     def get_binaries(self, references: Sequence[int], size: int) -> list[bytes]:
         """Return binary data, which the child reads at the addresses that the FMU gives."""

@@ -16,14 +16,15 @@ class SavedStates:
 
     Attributes
     ----------
-    handles : dict
-        The FMU's handles of those that are not freed yet.
+    kept : dict of int to weakref.finalize
+        Functions that free those that are not freed yet, by the identities of the FMU's handles.
     final : ctypes value
         Argument noSetFMUStatePriorToCurrentPoint of a step: true as long as no state has been saved.
     """
 
     def __init__(self, fmu: LoadedFmu):
-        self._fmu, self.handles = fmu, dict[int, Any]()
+        self._fmu = fmu
+        self.kept: dict[int, weakref.finalize[..., FmuState]] = {}
         self.final = fmu.fmi.final
 
     def save(self) -> FmuState:
@@ -35,7 +36,6 @@ class SavedStates:
     def keep(self, handle: Any) -> FmuState:
         """Return the saved state of a handle, as one of the present time."""
         self.final.value = False  # the FMU may be set back from now on
-        self.handles[id(handle)] = handle
         return FmuState(self, self._fmu.setup.label, handle, self._fmu.t, self._fmu.is_running)
 
     def go_back(self, state: FmuState) -> None:
@@ -69,14 +69,14 @@ class SavedStates:
         return state
 
     def release(self, handle: Any) -> None:
-        """Free the saved state of a handle, once."""
-        if self.handles.pop(id(handle), None) is not None:
-            self._fmu.free_state(handle)
+        """Free the saved state of a handle."""
+        del self.kept[id(handle)]
+        self._fmu.free_state(handle)
 
     def close(self) -> None:
         """Free all that are left."""
-        for handle in [*self.handles.values()]:
-            self.release(handle)
+        for free in [*self.kept.values()]:
+            free()
 
     def _check_can(self, flag: str, action: str, can: bool) -> None:
         label = self._fmu.setup.label
@@ -113,7 +113,7 @@ class FmuState:
         self.owner, self.label, self.t, self.running = owner, label, t, running
         self.steps: object = None  # what `Step.memory` has returned
         self.handle = handle
-        self._free = weakref.finalize(self, owner.release, handle)
+        self._free = owner.kept[id(handle)] = weakref.finalize(self, owner.release, handle)
         self._free.atexit = False  # the end of the process frees the memory anyway
 
     @property

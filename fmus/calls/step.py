@@ -207,7 +207,9 @@ class InstanceStep:
             found = status if place == self._place else 0
             self._is_read = False  # what has failed behind the step is read once more, where its end is judged
         if StepParts.ROLLBACK in self.parts:
-            self._kept = self._before = self._kept or self.states.keep(self._handle)
+            if self._kept is None or self._kept.is_free:
+                self._kept = self.states.keep(self._handle)
+            self._before = self._kept
         return found
 
     def _continue_step(self, status: int, t: float, h: float) -> None:

@@ -166,11 +166,30 @@ F(EnterInitializationMode)(void *c) { return act("enter", c, 0.0); }
 F(ExitInitializationMode)(void *c) { ((instance *)c)->running = true; return act("exit", c, 0.0); }
 F(Terminate)(void *c) { return act("terminate", c, 0.0); }
 F(Reset)(void *c) { ((instance *)c)->running = false; ((instance *)c)->y = 0.0; return act("reset", c, 0.0); }
-API void JOIN(JOIN(fmi, FMI), FreeInstance)(void *c) { if (act("free", c, 0.0) < 2 && c) free(c); }
 F(SetDebugLogging)(void) { return 0; }
-STATE(Get)(void *c, void **s) { *s = malloc(sizeof(instance)); memcpy(*s, c, sizeof(instance)); return act("save", c, 0.0); }
-STATE(Set)(void *c, void *s) { memcpy(c, s, sizeof(instance)); return act("restore", c, 0.0); }
-STATE(Free)(void *c, void **s) { free(*s); *s = NULL; return act("free_state", c, 0.0); }
+
+/* Saved states. With the fault "states owned" the FMU ends its process where one is used that is not there, or of another instance,
+   and where it frees an instance with states. */
+static struct { void *state; instance *of; } kept[32];
+static bool owned(void) { char f[64]; return match("states", 0.0, f) && IS("owned"); }
+static void check_state(void *s, instance *c) {
+    for (int i = 0; i < 32; i++) if (owned() && kept[i].state == s && kept[i].of == c) return;
+    if (owned()) abort();
+}
+static void keep(void *s, void *t, instance *c) { /* t in the place of s */
+    for (int i = 0; i < 32; i++) if (kept[i].state == s) { kept[i].state = t; kept[i].of = t ? c : NULL; return; }
+    if (owned()) abort();
+}
+API void JOIN(JOIN(fmi, FMI), FreeInstance)(void *c) {
+    for (int i = 0; owned() && i < 32; i++) if (kept[i].of == c) abort();
+    if (act("free", c, 0.0) < 2 && c) free(c);
+}
+STATE(Get)(void *c, void **s) {
+    if (*s) check_state(*s, c); else { *s = malloc(sizeof(instance)); keep(NULL, *s, c); }
+    memcpy(*s, c, sizeof(instance));
+    return act("save", c, 0.0); }
+STATE(Set)(void *c, void *s) { check_state(s, c); memcpy(c, s, sizeof(instance)); return act("restore", c, 0.0); }
+STATE(Free)(void *c, void **s) { if (*s) { check_state(*s, c); keep(*s, NULL, c); free(*s); *s = NULL; } return act("free_state", c, 0.0); }
 
 /* model exchange: der(y) = u, one indicator that never crosses zero */
 F(SetTime)(void *c, double t) { ((instance *)c)->t = t; return act("time", c, t); }

@@ -14,7 +14,7 @@ import pytest
 
 from loopwright.blocks import PID
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, Isolation
+from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, Isolation, StepOptions
 from loopwright.fmus.calls import FmuInstance, LoadedFmu
 from loopwright.fmus.fmu_block import setup_of
 from loopwright.fmus.isolation import count_processes, end_idle
@@ -300,6 +300,51 @@ def test_a_foreign_fmu_is_not_reset_but_made_anew(folder, isolate):
     finally:
         one.close()
         end_idle()
+
+
+@pytest.mark.parametrize(
+    ("isolate", "rollback", "fault"),
+    [
+        (True, True, "states owned"),
+        (True, False, "free_state error"),
+        pytest.param(True, False, "states owned", marks=pytest.mark.slow),
+        pytest.param(False, True, "states owned", marks=pytest.mark.slow),
+        pytest.param(False, False, "states owned", marks=pytest.mark.slow),
+    ],
+)
+def test_states_are_freed_before_their_instance(folder, isolate, rollback, fault):
+    """A fault that ends the process for a state of another instance, or one that is left; an error is no end."""
+    options = StepOptions(rollback=rollback)
+    plant = Fmu(zoo_fmu(folder, 3, fault), name="plant", isolate=isolate, stepping=options)
+    one = FmuInstance(setup_of(plant), [])
+    one.bind(np.zeros(0), np.zeros(1))
+    try:
+        for _ in range(3):
+            one.initialize(None, values={"u": 1.0})
+            one.begin()
+            start = one.save()
+            one.step(0.0, 0.5)
+            one.save()  # it has no name, so that it is freed
+            one.step(0.5, 0.5)
+            one.restore(start)
+            one.step(0.0, 0.25)
+            end = one.save()
+            assert one.values(["y"]) == 0.25
+            assert not start.is_free
+            one.reset()
+            assert start.is_free
+            assert end.is_free
+            with pytest.raises(FmuError, match="found a state that has been freed"):
+                one.restore(end)
+        one.initialize(None)
+        one.begin()
+        one.step(0.0, 0.5)
+        kept = one.save()
+    finally:
+        one.close()
+        end_idle()
+    assert kept.is_free
+    assert not [text for text in one.messages if "did not end well" in text]
 
 
 def test_an_own_build_is_reset(msd, monkeypatch):
