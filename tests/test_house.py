@@ -33,7 +33,7 @@ WORDS = re.compile(r"[A-Za-z]{2,}[^\n]* |\A[A-Z]?[a-z]{4,}[a-z ,.;:]*\Z| [^\n]*[
 ALLOWED = {
     "blocks/core/errors.py": {"; expected "},  # the form of every message: found, expected, next step
     "blocks/library/python_control.py": {"Discrete"},  # the beginning of a class's name
-    "diagrams/compiled/reordered.py": {"  return 0;\n", "casadi_real "},  # C code that CasADi writes
+    "diagrams/compiled/generated_text.py": {"  return 0;\n", "casadi_real "},  # C code that CasADi writes
     "diagrams/report/pages/svg.py": {r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)'},  # Matplotlib's SVG
     "fmus/calls/step_options.py": {"Loopwright"},  # the tool that has built an FMU: its description has it as a text
     "fmus/checks/libraries.py": {r"^\s*(\S+) => not found", "linux"},  # ldd's output; sys.platform

@@ -2,7 +2,7 @@
 
 from .background import BackgroundCode
 from .bound_functions import bind_call
-from .compiled_libraries import load_compiled
+from .compiled_libraries import load_compiled, load_runtime
 from .diagram_code import (
     DiagramCode,
     code_sources,
@@ -18,9 +18,8 @@ from .expanded_functions import LARGEST, ExpandedFunctions
 from .exported_memory import NamedCode, function_text, read_memory
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
-from .integration_methods import MethodOptions
+from .integration_methods import MethodOptions, StepFailure
 from .kernels import Kernel
-from .library_method import StepFailure
 from .loop_over_ticks import CompiledLoop, Outcome, ReturnReason
 from .loop_over_time import (
     BrokenOff,
@@ -29,11 +28,9 @@ from .loop_over_time import (
     Sign,
     Span,
 )
-from .model_exchange_hand_over import ModelExchangeHandOver
-from .model_exchange_in_c import NativeModelExchange, OwnEvent
+from .model_exchange_in_c import ModelExchangeHandOver, NativeModelExchange, OwnEvent
 from .newton import NewtonOptions
 from .plants_called_back import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
-from .runtime import load_runtime
 from .transport_delays import Delays, delays_of
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Libraries of generated C code: compiled, kept in the user's cache, and loaded."""
+"""Libraries of C code, loaded: generated code, compiled and kept in the user's cache; the runtime, the loop itself."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pathlib import Path
 from ...blocks.core import CompilerError, replace_file
 from ...fmus.export import compile_shared, describe_compiler
 from ...fmus.platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform
-from ...fmus.toolchain import DIAGRAM_FLAGS, SUFFIXES
+from ...fmus.runtime import installed_runtime, runtime_source
+from ...fmus.toolchain import DIAGRAM_FLAGS, RUNTIME_FLAGS, SUFFIXES
 
 _OURS = re.compile(r"[0-9a-f]{40}\.(size|so|dll|dylib)")
 """Names of what is in the folder of compiled diagrams; other files there are the user's."""
@@ -100,3 +101,17 @@ def _check_owner(folder: Path) -> None:
     for file in folder.iterdir() if was_open else ():  # what others may have left there would be run, too
         if _OURS.fullmatch(file.name):
             file.unlink(missing_ok=True)
+
+
+@lru_cache(maxsize=1)
+def load_runtime() -> ctypes.CDLL:
+    """Return the runtime library: that of the installation, else that of the cache, where it is compiled once."""
+    try:
+        return ctypes.CDLL(str(installed_runtime()))
+    except OSError:
+        return load_compiled(runtime_source(), RUNTIME_FLAGS)
+
+
+def runtime_is_kept() -> bool:
+    """Whether the runtime library can be loaded without a compiler."""
+    return installed_runtime().is_file() or is_kept(runtime_source(), RUNTIME_FLAGS)

@@ -16,11 +16,10 @@ from typing import Any
 from ...fmus.export import describe_processor, processor_flags
 from ..flat import NONE, FlatDiagram, TickPattern
 from .bound_functions import CodeOfFunctions, CompiledFunction, FunctionInC, GeneratedCode, Machine
-from .compiled_libraries import is_kept, load_compiled
+from .compiled_libraries import is_kept, load_compiled, load_runtime, runtime_is_kept
 from .expanded_functions import ExpandedFunctions, LoopEquations
 from .grouped_functions import GroupedFunctions
 from .rate_differences import SlopesByDifferences
-from .runtime import load_runtime, runtime_is_kept
 from .step_outputs import may_fail_at_steps
 
 FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")

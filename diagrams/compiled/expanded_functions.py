@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
+import ctypes
+import re
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import CompilerError
+from ...fmus.runtime import read_sources
 from ..flat import NONE, FlatDiagram, OpaqueStage, Schedule, TickPattern, share_terms
-from .bound_functions import CodeOfFunctions, CompiledFunction, FunctionInC, GeneratedCode
-from .generated_text import write_functions
+from .bound_functions import (
+    BlockBinder,
+    BoundFunction,
+    CodeOfFunctions,
+    CompiledFunction,
+    FunctionInC,
+    GeneratedCode,
+    TickStructure,
+    address_of,
+)
+from .compiled_libraries import load_runtime
+from .generated_text import put_in_order, write_functions
+from .method_coefficients import error_exponent, tableau
+from .model_exchange_in_c import StageStructure
 from .rate_differences import Columns, SlopesByDifferences
-from .reordered import put_in_order
-from .small_steps import STEPS, write_steps
-from .staged import Staged
 
 _Clocks = frozenset[TickPattern]
 
 LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
+STEPS = {"rk4": "step_rk4", "RK23": "step_rk23", "RK45": "step_rk45"}
+"""Names of generated steps in C, by method."""
+_MOST_STATES, _MOST_OPERATIONS = 8, 120  # of rates that are inlined into steps
+_CASADI = re.compile(r"\b(_?(?:casadi|CASADI)_)")
 
 
 class _TracedFunctions:
@@ -159,3 +176,80 @@ class LoopEquations(_TracedFunctions):
             for clocks, (part, columns) in self._staged.items()
         }
         return {**staged, **{clocks: code.find(function) for clocks, function in self._straight.items()}}
+
+
+class _ScheduleInC(ctypes.Structure):
+    _fields_ = [("count", ctypes.c_int64), ("stages", ctypes.c_void_p)]
+
+
+@dataclass(frozen=True, eq=False)
+class Staged(FunctionInC):
+    """A schedule whose traced stages, in their order, are functions in C."""
+
+    schedule: Schedule
+    functions: Sequence[CompiledFunction]
+
+    @property
+    def calls_python(self) -> bool:
+        """Whether Python evaluates some of its functions."""
+        return any(function.calls_python for function in self.functions)
+
+    def bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
+    ) -> BoundFunction:
+        """Return it bound to vectors, for one call at a time; ``bind_block`` binds the stages between."""
+        assert bind_block is not None
+        schedule, functions = self.schedule, iter(self.functions)
+        c = np.zeros(schedule.width)
+        vectors = [*arguments, c] if schedule.width else [*arguments]
+        made, seen, kept = (StageStructure * len(schedule.stages))(), set[str](), list[Any]()
+        for i, stage in enumerate(schedule.stages):
+            if isinstance(stage, OpaqueStage):
+                made[i] = bind_block(stage, arguments[0], c, again=stage.path in seen)
+                seen.add(stage.path)
+                continue
+            kept.append(next(functions).bind(vectors, results if stage is schedule.last else [c[stage.makes]]))
+            made[i].f = kept[-1].structure
+        found = _ScheduleInC(len(made), ctypes.addressof(made))
+        address, last = address_of(load_runtime(), "loopwright_stages"), made[len(made) - 1].f.results
+        structure = TickStructure(address, None, last, ctypes.addressof(found), None)
+        return BoundFunction(structure, arguments, results, found, c, [self, *kept, made])
+
+    def hand_over(self, to: Any) -> None:
+        """Let generated code of the same stages take over."""
+        for one, other in zip(self.functions, to.functions, strict=True):
+            one.hand_over(other)
+
+
+def write_steps(rates: Any, where: Sequence[int]) -> str:
+    """Return the C code of steps for one small differential equation, with rates by (t, x, w, p).
+
+    The rates are inlined into every stage of a method. Empty where they are too large for that.
+    """
+    n = len(where)
+    if not (0 < n <= _MOST_STATES and rates.is_a("SXFunction") and rates.n_instructions() <= _MOST_OPERATIONS):
+        return ""
+    text = write_functions("rates", [share_terms(rates, "rates")]).replace(
+        "static int casadi_f0(", "INLINE int casadi_f0("
+    )
+    numbers = f"#define N {n}\n#define WIDTH {rates.numel_in(1)}\n#define PLACES {', '.join(map(str, where))}\n"
+    numbers += "#define INLINE static inline __attribute__((always_inline))\n"
+    named = _CASADI.sub(r"of_\1", text) + "#define RATES(a, r) of_casadi_f0(a, r, NULL, NULL, 0)\n"
+    return "\n".join([read_sources("newton.c", "problem.c"), numbers, named, read_sources("small.c"), _embedded()])
+
+
+@lru_cache(maxsize=1)
+def _embedded() -> str:
+    """Return the steps of embedded methods, with the coefficients of SciPy's methods."""
+    return "".join(map(_write_embedded, ("RK23", "RK45")))
+
+
+def _write_embedded(name: str) -> str:
+    found = tableau(name)
+    texts = [
+        f"    static const double {letter}[] = {{{', '.join(map(float.hex, found[letter].ravel().tolist()))}}};\n"
+        for letter in "ABCE"
+    ]
+    numbers = f"{len(found['B'])}, A, B, C, E, NULL, {float(error_exponent(name))}"
+    call = f"    return step_small(m, &(lw_tableau){{{numbers}}});\n"
+    return f"\nVISIBLE int {STEPS[name]}(method *m) {{\n" + "".join(texts) + call + "}\n"

@@ -17,8 +17,7 @@ from .bound_functions import GeneratedCode
 from .compiled_libraries import load_compiled
 from .diagram_code import FUSING, DiagramCode, compile_code
 from .expanded_functions import ExpandedFunctions, LoopEquations
-from .generated_text import write_functions
-from .reordered import reorder
+from .generated_text import reorder, write_functions
 
 _LIMIT = "0x1p20"  # LW_FAST_LIMIT
 _KINDS_WRITTEN_TWICE = 16  # kinds of ticks that are written twice

@@ -24,11 +24,11 @@ from .bound_functions import (
     call_for_c,
     list_vectors,
 )
+from .compiled_libraries import load_runtime
 from .grouping import BlockCalls, PartTables, PythonCall, TickTables, make_part_tables, make_tables
 from .kernels import BlockKinds, Kernels
 from .machine import BlockProgramStructure
 from .rate_differences import Columns, SlopesByDifferences, find_columns
-from .runtime import load_runtime
 
 _AT, _INT = ctypes.c_void_p, ctypes.c_int64
 _Python = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, ctypes.c_int64)

@@ -14,13 +14,13 @@ from ...blocks.core import SimulationError
 from ...fmus.calls import NEAR, FmuInstance
 from ..flat import TRUE, StepTable, TickPattern
 from .bound_functions import CALL, TICK, MemoryForC, TickStructure, at
+from .compiled_libraries import load_runtime
 from .diagram_code import DiagramCode
 from .model_exchange_in_c import NativeModelExchange
 from .newton import NewtonOptions, NewtonStructure
 from .plants_called_back import PythonStep
 from .plants_of_loop import LoopPlants
 from .rate_differences import SlopesByDifferences
-from .runtime import load_runtime
 
 _SEEN = 1e-6  # least singular value, relative to 1 + the loop's gain, that differences surely tell from 0
 

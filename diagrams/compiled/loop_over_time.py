@@ -13,17 +13,16 @@ import numpy as np
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, MethodKind
 from .bound_functions import CALL, MemoryForC, at
+from .compiled_libraries import load_runtime
 from .diagram_code import DiagramCode
 from .differential_equation import DifferentialEquation
 from .event_domains import Domains
 from .events_in_c import Fired, Pile, Watch
 from .hybrid_structures import HybridStructure, SpanStructure
-from .integration_methods import IntegrationMethod, MethodOptions
-from .library_method import StepFailure
+from .integration_methods import IntegrationMethod, MethodOptions, StepFailure
 from .loop_over_ticks import CompiledLoop, Outcome, OutcomeStructure
 from .model_exchange_in_c import NativeModelExchange
 from .newton import NewtonOptions
-from .runtime import load_runtime
 from .transport_delays import Delays
 
 _SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn

@@ -14,7 +14,7 @@ from ...blocks.core import LoopwrightError
 from ...fmus.calls import ERROR, BoundCalls, QuietStep, RemoteStep, SharedValues
 from ...fmus.isolation import ChildProcess, ChildRequest
 from .bound_functions import at
-from .runtime import load_runtime
+from .compiled_libraries import load_runtime
 
 UNDER_WAY, REFUSED, TAKEN_BY_PYTHON = 3, 4, 5
 """Stages at which such an FMU is left to Python: its step has begun; no step has, as an input doesn't fit; Python has

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..flat import Operation, PartProgram
 from .bound_functions import BlockBinder, BoundFunction, FunctionInC, TickStructure, address_of, at, list_vectors
+from .compiled_libraries import load_runtime
 from .newton import NewtonStructure
-from .runtime import load_runtime
 
 _AT, _INT = ctypes.c_void_p, ctypes.c_int64
 

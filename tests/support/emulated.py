@@ -21,7 +21,7 @@ import unicorn
 from unicorn import arm64_const as arm
 from unicorn import x86_const as x86
 
-from loopwright.diagrams.compiled import bound_functions, compiled_libraries, plants_called_back, runtime
+from loopwright.diagrams.compiled import bound_functions, compiled_libraries, plants_called_back
 from loopwright.fmus.export import compile_shared
 from loopwright.fmus.toolchain import DIAGRAM_FLAGS
 
@@ -288,7 +288,7 @@ def emulate(patch, platform, folder):
 
     Its steps of FMUs are not for Windows, whose calls place numbers and integers in one order.
     """
-    processor, known, native_runtime = Processor(platform), {}, runtime.load_runtime
+    processor, known, native_runtime = Processor(platform), {}, compiled_libraries.load_runtime
 
     def load(source, flags=(), processor_of=""):
         if (source, flags) not in known:
@@ -303,8 +303,8 @@ def emulate(patch, platform, folder):
         made.processor = processor
         return made
 
-    patch.setattr(runtime, "installed_runtime", lambda: folder / "none")
-    _replace(patch, runtime.load_runtime, lru_cache(runtime.load_runtime.__wrapped__))
+    patch.setattr(compiled_libraries, "installed_runtime", lambda: folder / "none")
+    _replace(patch, compiled_libraries.load_runtime, lru_cache(compiled_libraries.load_runtime.__wrapped__))
     _replace(patch, compiled_libraries.load_compiled, load)
     patch.setattr(plants_called_back, "load_runtime", native_runtime)  # code of other processes
     patch.setattr(bound_functions, "TICK", function)

@@ -103,15 +103,15 @@ def seed_fault(text, name):
 
 def main(name, file):
     """Run the diagrams of a file with a fault, and print in how many it shows, and how many there are."""
-    from loopwright.diagrams.compiled import runtime
+    from loopwright.diagrams.compiled import compiled_libraries
     from loopwright.fmus.runtime import runtime_source
 
     from .random_hybrid import differences, make, run
 
     text = runtime_source()
     changed = seed_fault(text, name) if name else text
-    runtime.runtime_source = lambda: changed  # nothing has been loaded yet
-    runtime.installed_runtime = lambda: Path("none")
+    compiled_libraries.runtime_source = lambda: changed  # nothing has been loaded yet
+    compiled_libraries.installed_runtime = lambda: Path("none")
     shown = 0
     records = pickle.loads(Path(file).read_bytes())
     for (family, seed), expected in records.items():

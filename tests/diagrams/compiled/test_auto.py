@@ -19,7 +19,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Run, subsystem
-from loopwright.diagrams.compiled import background, compiled_libraries, expanded_functions, runtime
+from loopwright.diagrams.compiled import background, compiled_libraries, expanded_functions
 from loopwright.diagrams.simulation import RunOptions, change_over, sampled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
@@ -150,7 +150,7 @@ def test_a_missing_compiler_is_told_once(eager, no_compiler):
 
 def test_a_cache_that_fails_leaves_the_run_interpreted_and_is_told(eager, monkeypatch, tmp_path):
     compiled_libraries.load_compiled.cache_clear()
-    runtime.load_runtime.cache_clear()
+    compiled_libraries.load_runtime.cache_clear()
     (tmp_path / "file").touch()
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "file"))
     run = sums().simulate(20.0, compile="auto", **QUIET)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.diagrams import Diagram
-from loopwright.diagrams.compiled.model_exchange_hand_over import ModelExchangeHandOver
+from loopwright.diagrams.compiled.model_exchange_in_c import ModelExchangeHandOver
 from loopwright.fmus import Fmu, bouncing_ball
 
 TIGHT = {"rtol": 1e-8, "atol": 1e-10, "progress": False}

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from loopwright.blocks import Clock, Gain, Sine, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.compiled.reordered import reorder
+from loopwright.diagrams.compiled.generated_text import reorder
 from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, dc_motor, gantry_contact
 
 QUIET = {"progress": False}

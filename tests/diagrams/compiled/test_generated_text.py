@@ -6,8 +6,7 @@ import casadi as ca
 
 from loopwright.diagrams import experiments
 from loopwright.diagrams.compiled import write_code
-from loopwright.diagrams.compiled.generated_text import write_functions
-from loopwright.diagrams.compiled.reordered import put_in_order
+from loopwright.diagrams.compiled.generated_text import put_in_order, write_functions
 from loopwright.diagrams.flat import kinds_of
 
 ASKED = re.compile(r"arg\[\d+\]\?|if\s*\(res\[\d+\]!=0\)")

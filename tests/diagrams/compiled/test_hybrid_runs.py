@@ -256,11 +256,11 @@ def test_a_run_to_disk_is_the_same(tmp_path):
 
 
 def test_a_run_without_a_compiler_is_interpreted_and_says_so(monkeypatch):
-    from loopwright.diagrams.compiled import compiled_libraries, runtime
+    from loopwright.diagrams.compiled import compiled_libraries
 
     monkeypatch.setenv("LOOPWRIGHT_CC", "no-such-compiler")
     compiled_libraries.load_compiled.cache_clear()
-    runtime.load_runtime.cache_clear()
+    compiled_libraries.load_runtime.cache_clear()
     run = oscillator(omega=3.0).simulate(1.0, compile=True, **QUIET)
     assert [m for m in run.messages if "no-such-compiler" in m]
     assert np.max(np.abs(run["x.y"] - np.cos(3.0 * run.t))) < 1e-4

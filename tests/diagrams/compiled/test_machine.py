@@ -8,8 +8,8 @@ import pytest
 from scipy.special import erfinv
 
 from loopwright.diagrams.compiled.bound_functions import Machine, operation_names
+from loopwright.diagrams.compiled.compiled_libraries import load_runtime
 from loopwright.diagrams.compiled.machine import make_program
-from loopwright.diagrams.compiled.runtime import load_runtime
 
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 1e-310, 1e300, -1e300, np.inf, -np.inf, np.nan, 3.0, 1e16, np.pi]
 EXACT = {"ASSIGN", "LIFT", "INPUT", "OUTPUT"}  # no operation of their own on numbers

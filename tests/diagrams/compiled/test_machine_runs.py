@@ -160,18 +160,18 @@ def test_sampled_runs_and_events_make_no_difference_either(swapped):
 
 
 def test_without_a_library_and_a_compiler_the_error_says_what_to_install(monkeypatch, tmp_path):
-    from loopwright.diagrams.compiled import compiled_libraries, runtime
+    from loopwright.diagrams.compiled import compiled_libraries
 
-    monkeypatch.setattr(runtime, "installed_runtime", lambda: tmp_path / "none.so")
+    monkeypatch.setattr(compiled_libraries, "installed_runtime", lambda: tmp_path / "none.so")
     monkeypatch.setenv("PATH", "")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    for kept in (runtime.load_runtime, compiled_libraries.load_compiled):
+    for kept in (compiled_libraries.load_runtime, compiled_libraries.load_compiled):
         kept.cache_clear()
     try:
         with pytest.raises(CompilerError, match=r"pip install.*loopwright\[build\]"):
             oscillator().simulate(3.0, step=1e-3, compile=False, **QUIET)
     finally:
-        runtime.load_runtime.cache_clear()
+        compiled_libraries.load_runtime.cache_clear()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends itself a signal")

@@ -6,7 +6,7 @@ import pytest
 from loopwright.blocks import Integrator, Product, Relay, Sine, Step, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import expanded_functions
-from loopwright.diagrams.compiled.small_steps import write_steps
+from loopwright.diagrams.compiled.expanded_functions import write_steps
 
 QUIET = {"progress": False, "compile": True}
 
