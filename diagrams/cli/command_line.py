@@ -11,8 +11,10 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from typing import NoReturn
 
-from ...blocks.core import LoopwrightError, OptionError
+from ...blocks.core import LoopwrightError, OptionError, near
+from ...blocks.names_of_other_tools import DURATION, STEP
 from .build import BUILD
 from .c_code import C
 from .doctor import DOCTOR
@@ -24,13 +26,27 @@ from .run import RUN
 from .ssp import SSP
 from .sweep import SWEEP
 from .text import say
-from .unknown_options import check_command, explain_unknown
 from .validate import VALIDATE
 
 COMMANDS = {
     command.name: command for command in (RUN, DRAW, SWEEP, REPORT, PAGE, C, BUILD, INSPECT, VALIDATE, DOCTOR, SSP)
 }
 """All commands by their names, in the order of the help."""
+_OPTION_WORDS = {
+    **dict.fromkeys(DURATION, "--duration"),
+    **dict.fromkeys(STEP, "--step"),
+    **dict.fromkeys(("param", "parameter", "parameters", "start_values"), "--set"),
+    **dict.fromkeys(("output", "o", "output_file", "outdir", "folder"), "--out"),
+}
+_COMMAND_WORDS = {
+    **dict.fromkeys(("simulate", "sim", "start", "plot"), "run"),
+    **dict.fromkeys(("export", "compile"), "build"),
+    **dict.fromkeys(("info", "dump", "show"), "inspect"),
+    **dict.fromkeys(("analyse", "analyze", "check"), "report"),
+    **dict.fromkeys(("html", "web"), "page"),
+    "codegen": "c",
+}
+"""Words of other tools for options, and for commands."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_command(parser, sys.argv[1:] if argv is None else argv, [*COMMANDS])
         arguments, unknown = parser.parse_known_args(argv)
         if unknown:
-            explain_unknown(parsers.get(arguments.command, parser), unknown)
+            _explain_unknown(parsers.get(arguments.command, parser), unknown)
     except SystemExit as stop:
         return int(stop.code or 0)
     if arguments.command is None:
@@ -88,3 +104,24 @@ def _version() -> str:
         return version("loopwright")
     except PackageNotFoundError:
         return "(not installed)"
+
+
+def check_command(parser: argparse.ArgumentParser, given: Sequence[str], known: Sequence[str]) -> None:
+    """Print the usage, and the command that may be meant, where there is none of that name; then exit."""
+    name = next(iter(given), "-")
+    if not name.startswith("-") and name not in known:
+        offer = f"Did you mean {_COMMAND_WORDS[name]!r}?" if name in _COMMAND_WORDS else near(name, known)
+        parser.error(f"there is no command {name!r}. {offer}")
+
+
+def _explain_unknown(command: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:
+    """Print the usage of a command and, for each option that it doesn't have, the one that may be meant; then exit."""
+    known = [text for action in command._actions for text in action.option_strings if text.startswith("--")]
+    texts = []
+    for given in unknown:
+        name = given.partition("=")[0]
+        meant = _OPTION_WORDS.get(name.lstrip("-").replace("-", "_"), "")
+        if name.startswith("-"):
+            offer = f"Did you mean {meant!r}?" if meant in known else near(name, known)
+            texts.append(f"there is no option {name}. {offer}")
+    command.error(" ".join(texts) or f"unrecognized arguments: {' '.join(unknown)}")

@@ -4,11 +4,10 @@ from .connection_delays import CouplingReport, HeldFrom, LinkKind, report_coupli
 from .coupled_steps import CoupledSteps, passes_slopes
 from .coupling_options import Coupling, Scheme, refuse_model_exchange, to_coupling
 from .fixed_points import find_fixed_point
-from .links import Links
+from .links import Links, note_loops
 from .plant_steps import PlantSteps, end_all, runs_apart, step_all
 from .plants import Plant, bind, load_plants, note_steps
 from .rollback import accept_steps, try_steps
-from .unsolved_loops import note_loops
 
 __all__ = [
     "CoupledSteps",

@@ -1,4 +1,7 @@
-"""Links between plants within a communication step: what an input follows, and what passes it straight on."""
+"""Links between plants within a communication step: what an input follows, and what passes it straight on.
+
+Loops of direct feedthrough across FMUs are reported where a coupling does not solve them.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ...blocks.core import OptionError, near
 from ..flat import FlatDiagram
-from ..wiring import join, stepped_blocks
+from ..wiring import Structure, join, stepped_blocks
+from .coupling_options import Coupling, Scheme
 from .plants import part_of
+
+_KNOWN: WeakKeyDictionary[FlatDiagram, bool] = WeakKeyDictionary()
+"""Whether wires close a loop across FMUs, by diagrams that have run: a tenth of the set-up of a run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,4 +233,57 @@ def direct_ports(flat: FlatDiagram, *, wired: bool = False) -> set[tuple[str, st
                         continue
                     if ins is None or outs is None or plant.description.feeds_through(ins[port], outs[output]):
                         found.add((path, port, output))
+    return found
+
+
+def note_loops(flat: FlatDiagram, coupling: Coupling) -> tuple[str, ...]:
+    """Return a message for each loop of direct feedthrough that the coupling leaves with values of the last step."""
+    if coupling.scheme == Scheme.ITERATED:
+        return ()
+    if flat not in _KNOWN:
+        _KNOWN[flat] = _may_loop(flat)
+    if not _KNOWN[flat]:
+        return ()
+    return tuple(
+        f"{', '.join(ports)}: by their model structures these outputs follow one another at once, in a loop across "
+        "FMUs (an output without stated dependencies counts as one that follows all inputs). With coupling "
+        f"{str(coupling)!r} each follows the others one communication step later. Take coupling='iterated', which "
+        "solves the loop."
+        for ports in Links(flat).loops
+    )
+
+
+def _may_loop(flat: FlatDiagram) -> bool:
+    """Whether wires in continuous time close a loop through inputs that FMUs pass straight on; without any trace."""
+    table, straight = flat.table, direct_ports(flat, wired=True)
+    outputs = {(path, output) for path, _, output in straight}
+    inputs = {(path, port) for path, port, _ in straight}
+    after = {output: _inputs_behind(flat, table, *output) & inputs for output in outputs}
+    follows = {
+        output: {(path, other) for path, port, other in straight if (path, port) in reached}
+        for output, reached in after.items()
+    }
+    for first in outputs:
+        seen, todo = set[tuple[str, str]](), [*follows[first]]
+        while todo:
+            at = todo.pop()
+            if at == first:
+                return True
+            if at not in seen:
+                seen.add(at)
+                todo += follows[at]
+    return False
+
+
+def _inputs_behind(flat: FlatDiagram, table: Structure, path: str, port: str) -> set[tuple[str, str]]:
+    """Return the inputs of plants that a port reaches through blocks in continuous time."""
+    found, seen = set[tuple[str, str]](), set[str]()
+    todo = [(block, q) for (block, q), wire in table.wires.items() if (wire.block, wire.port) == (path, port)]
+    while todo:
+        block, q = todo.pop()
+        if block in flat.plant_ticks:
+            found.add((block, q))
+        elif block not in seen and table.subsystem_of[block] not in flat.clocks:
+            seen.add(block)
+            todo += [(b, r) for (b, r), wire in table.wires.items() if wire.block == block]
     return found

@@ -1,18 +1,13 @@
 """Structure of a diagram: blocks, wires, subsystems, checks and the order of evaluation."""
 
-from .absent_states import explain_absent_state
 from .buses import Bus
 from .check import Checked, check
 from .collector import Collector
-from .cycles import find_cyclic_parts
 from .delay_blocks import add_delay_blocks
-from .entry_names import index_of, split_entry
-from .entry_order import OrderStep
-from .evaluation_order import Order, find_orders
+from .evaluation_order import Order, OrderStep, find_cyclic_parts, find_orders
 from .first_order_hold import first_order_hold
-from .parameter_names import find_control, find_name, find_path, find_place, split_path
-from .structure import Structure, Wire, join, stepped_blocks
-from .structure_table import sheet_of_structure
+from .parameter_names import find_control, find_name, find_path, find_place, index_of, split_entry, split_path
+from .structure import Structure, Wire, explain_absent_state, join, sheet_of_structure, stepped_blocks
 from .subsystem_settings import SubsystemSettings, SubsystemTable, exact_time
 from .subsystems import Subsystem, SubsystemCall, subsystem
 from .variants import apply_changes, change_parameter, change_parameters

@@ -1,20 +1,33 @@
 """Names of parameters: dotted paths, or their unique ends, each with one spelling in full.
 
-All that takes parameters by name finds them here: variants, sweeps, sensitivities, worst cases and trims.
+All that takes parameters by name finds them here: variants, sweeps, sensitivities, worst cases and trims. Behind the
+name of a parameter or a signal may be an entry of an array: ``name[i]``, or ``name[i,j]`` of a matrix, counted from 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
-from ...blocks.core import Block, OptionError, UnknownNameError, Value, elements, enumerate_some, near, shorten
-from .entry_names import index_of, split_entry
+from ...blocks.core import (
+    Block,
+    OptionError,
+    ParameterError,
+    UnknownNameError,
+    Value,
+    elements,
+    enumerate_some,
+    near,
+    shorten,
+)
 from .structure import Structure
 
 OF_A_SUBSYSTEM = ("sample_time", "method", "offset", "delay")
 """Settings of a subsystem that have names like parameters."""
+Entry = tuple[int, ...]
+"""Numbers in brackets behind a name, counted from 1; none for the whole array."""
 
 
 def find_name(table: Structure, name: object, diagram: str) -> str:
@@ -192,3 +205,41 @@ def _entry_inside(block: Block, path: str, keys: list[str], entry: tuple[int, ..
     except UnknownNameError as error:
         raise error.at(block=path) from None
     return [*keys[:-1], elements(keys[-1], array.shape)[int(np.ravel_multi_index(place, array.shape))]]
+
+
+def split_entry(name: str, known: Collection[str]) -> tuple[str, Entry]:
+    """Return a name and the entry behind it; a known name may end in brackets, too."""
+    found = re.fullmatch(r"(.+)\[(\d+(?:,\d+)*)\]", name)
+    if found is None or name in known:
+        return name, ()
+    return found[1], tuple(int(i) for i in found[2].split(","))
+
+
+def index_of(entry: Entry, shape: tuple[int, ...], name: str) -> tuple[int, ...]:
+    """Return the index of an entry in an array of a shape, counted from 0."""
+    if len(entry) == len(shape) and all(1 <= i <= n for i, n in zip(entry, shape, strict=True)):
+        return tuple(i - 1 for i in entry)
+    if len(entry) == 1 and 1 <= entry[0] <= int(np.prod(shape)) and shape:
+        return tuple(int(i) for i in np.unravel_index(entry[0] - 1, shape))
+    raise UnknownNameError(
+        f"{name!r} has no entry {list(entry)}; expected one within its shape {shape}, counted from 1."
+        if shape
+        else f"{name!r} has no entry {list(entry)}, as it is a scalar. Leave the brackets out."
+    )
+
+
+def with_entry(array: object, entry: Entry, value: object, name: str) -> object:
+    """Return an array of numbers with another value of one entry: an array, or lists if it was none."""
+    whole = np.asarray(array)
+    if whole.dtype.kind not in "iuf":
+        raise UnknownNameError(f"{name!r} is {shorten(array)}, without entries that are numbers. Name it alone.")
+    place = index_of(entry, whole.shape, name)
+    number = np.asarray(value)
+    if number.ndim or number.dtype.kind not in "iuf":
+        raise ParameterError(
+            f"found {shorten(value)} for entry {list(entry)}; expected one number. Give the whole array as {name!r}.",
+            port=name,
+        )
+    changed = whole.astype(np.result_type(whole, number))
+    changed[place] = number
+    return changed if isinstance(array, np.ndarray) else changed.tolist()

@@ -1,4 +1,4 @@
-"""The structure of a diagram: every block with its path, every input with its source.
+"""The structure of a diagram: every block with its path, every input with its source; and as a table.
 
 Wires lead from block to block, across the borders of subsystems.
 """
@@ -10,10 +10,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, Shape, explain_calls
+from ...blocks.core import Block, Grid, Shape, Sheet, count_of, explain_calls
 from .subsystem_settings import SubsystemSettings
 
 
@@ -134,3 +135,35 @@ def stepped_blocks(table: Structure, inside: str = "") -> dict[str, Block]:
 def join(subsystem: str, name: str) -> str:
     """Return the dotted path of ``name`` in a subsystem."""
     return f"{subsystem}.{name}" if subsystem else name
+
+
+def sheet_of_structure(name: str, table: Structure) -> Sheet:
+    """Return a diagram as it is shown: its subsystems with their rates, its blocks, its named wires."""
+    subsystems = [(path, settings) for path, settings in table.subsystems.items() if path]
+    rate = table.rate("")
+    rows = []
+    for path, settings in subsystems:
+        own = table.rate(path)
+        inside = sum(f"{at}.".startswith(f"{path}.") for at in table.subsystem_of.values())
+        clock = "continuous" if own is None else f"{float(own):g} s"
+        rows.append((path, clock, settings.control, inside, ", ".join(settings.inputs), ", ".join(settings.outputs)))
+    columns = "subsystem", "sample time", "", "blocks", "inputs", "outputs"
+    return Sheet(
+        f"diagram {name!r}: {count_of(len(table.blocks), 'block')}",
+        (("sample time", "" if rate is None else f"{float(rate):g} s"),),
+        (
+            Grid("Subsystems", columns, tuple(rows)),
+            Grid("Blocks", ("block", "kind"), tuple((path, b.drawn_as) for path, b in table.blocks.items())),
+            Grid("Named wires", ("wire", "from"), tuple((wire, str(source)) for wire, source in table.names.items())),
+        ),
+    )
+
+
+def explain_absent_state(blocks: Mapping[str, Any], name: str) -> str:
+    """Return why a state whose path is, or ends in, ``name`` is left out, with a next step; "" if none is."""
+    for path, block in blocks.items():
+        for state, reason in getattr(block, "absent_states", {}).items():
+            full = join(path, state)
+            if full == name or full.endswith("." + name):
+                return f"{path!r} has no state {state!r}: {reason}."
+    return ""

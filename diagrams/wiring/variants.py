@@ -19,8 +19,7 @@ from ...blocks.core import (
     near,
     shorten,
 )
-from .entry_names import split_entry, with_entry
-from .parameter_names import OF_A_SUBSYSTEM, check_name, find_path, find_place, name_parameters
+from .parameter_names import OF_A_SUBSYSTEM, check_name, find_path, find_place, name_parameters, split_entry, with_entry
 from .structure import Structure
 
 V = TypeVar("V", bound=Value)
