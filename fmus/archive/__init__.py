@@ -4,13 +4,12 @@ from .archive_limits import ArchiveLimits
 from .binaries import check_binary, missing_functions
 from .description import FmuDescription, find_description, kept_description, read_description
 from .faults import FmuFault, FmuFinding, FmuSeverity
-from .fmpy_description import read_model
+from .fmpy_description import read_model, repair
 from .gathering import read_index
+from .interfaces import ModelExchangeInfo
 from .joining import join_scalars
 from .library_headers import SharedLibrary, read_library
-from .model_exchange_description import ModelExchangeInfo
 from .parsed_xml import parse_xml
-from .repair import repair
 from .unit_definitions import FmuUnits
 from .unpacking import unpack, unpack_archive, write_files
 from .variables import FmuVariable, OtherVariable, inexact

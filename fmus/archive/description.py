@@ -28,23 +28,26 @@ from ...blocks.core import (
     kinds,
 )
 from ..host_state import FOLDER
-from .aliases import find_aliases
+from .aliases import find_aliases, judge_negated, read_negated
 from .archive_limits import ArchiveLimits
 from .binaries import find_binary, judge_name
-from .capabilities import derivatives_flag, has_flag, read_capabilities, state_flags
 from .faults import FmuFault, FmuFinding
-from .feedthrough import Dependencies, read_dependencies
-from .fmpy_description import read_model
+from .fmpy_description import read_model, resize
 from .gathering import Elements, gather
-from .model_exchange_description import ModelExchangeInfo, read_model_exchange
-from .negated import judge_negated, read_negated
+from .interfaces import (
+    Dependencies,
+    ModelExchangeInfo,
+    derivatives_flag,
+    read_co_simulation,
+    read_dependencies,
+    read_model_exchange,
+    state_flags,
+)
 from .parsed_xml import parse_xml
 from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
-from .sizes import resize
 from .states import find_states, read_derivatives
 from .unit_definitions import FmuUnits
-from .variable_table import variable_grid
-from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_other, read_variable
+from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_other, read_variable, variable_grid
 from .zip_file import DESCRIPTION, OTHER_PLACE, FmuArchive
 
 _DROPPED = ("UInt", "Clock")
@@ -421,7 +424,7 @@ def _read(
 def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dict[str, Any]:
     """Return the variables, states and capabilities of an FMU, as arguments of its description."""
     version = model.fmiVersion
-    flags = _read_co_simulation(root, version)
+    flags = read_co_simulation(root, version)
     if model.modelExchange is not None:
         with suppress(FmuFileError):  # without a library for this platform it is as good as none
             binary = find_binary(path, entries, version, model.modelExchange.modelIdentifier)
@@ -462,30 +465,6 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
         "unit_complaints": tuple(units.complaints),
         **flags,
     }
-
-
-def _read_co_simulation(root: Any, version: str) -> dict[str, Any]:
-    """Return the capabilities of co-simulation (FMI 2.0, 4.3.1; FMI 3.0, 4.4), some of which FMPy drops."""
-    steps = root.find("Implementation//Capabilities" if version == "1.0" else "CoSimulation")
-    two = not version.startswith("3.")
-    fixed = None if steps is None or two else steps.get("fixedInternalStepSize")
-    experiment = root.find("DefaultExperiment")
-    return {
-        **read_capabilities(steps, version),
-        "has_event_mode": has_flag(steps, "hasEventMode"),
-        "interpolates_inputs": has_flag(steps, "canInterpolateInputs" if two else "providesIntermediateUpdate"),
-        "variable_step": has_flag(steps, "canHandleVariableCommunicationStepSize"),
-        "fixed_internal_step": None if fixed is None else float(fixed),
-        "stop_time": None if experiment is None else _number(experiment.get("stopTime")),
-        "step_size": None if experiment is None else _number(experiment.get("stepSize")),
-    }
-
-
-def _number(text: str | None) -> float | None:
-    try:
-        return None if text is None else float(text)
-    except ValueError:
-        return None
 
 
 def _dropped_attributes(root: Any) -> dict[str, Mapping[str, str]]:

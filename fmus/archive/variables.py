@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import explain_calls
+from ...blocks.core import Grid, explain_calls
 from .unit_definitions import FmuUnits
 
 _FMI2_TYPES = {"Real": "Float64", "Integer": "Int32"}
@@ -297,3 +297,25 @@ def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
         raise ValueError(f"{values.size} start values; expected {n}, as its dimensions say, or one")
     full = np.broadcast_to(values, (n,)) if values.size == 1 else values
     return np.array(full).reshape(shape)
+
+
+def variable_grid(title: str, variables: Mapping[str, FmuVariable], started: Mapping[str, Any]) -> Grid:
+    """Return a table of variables by the names of their ports; ``started`` has start values that replace their own."""
+    rows = tuple(
+        (
+            name,
+            "" if name == v.name else v.name,
+            _plain_start(started.get(v.name, v.start)),
+            "" if v.unit in (None, "1") else v.unit,
+            "" if v.type == "Float64" else v.type,
+            " × ".join(map(str, v.shape)),
+            v.description,
+        )
+        for name, v in variables.items()
+    )
+    return Grid(title, ("name", "in the FMU", "start", "unit", "type", "shape", "description"), rows)
+
+
+def _plain_start(value: Any) -> Any:
+    """Return a start value: a number as such, where its array has no dimensions."""
+    return value.item() if isinstance(value, np.ndarray | np.generic) and np.ndim(value) == 0 else value

@@ -1,11 +1,9 @@
-"""Reasons for the end of a child, from its exit status; and the copy of its files, and the cores for it."""
+"""Reasons for the end of a child: what its exit status, its last words and its memory say."""
 
 from __future__ import annotations
 
 import os
-import shutil
 import signal
-from collections.abc import Sequence
 from pathlib import Path
 
 from ...blocks.core import FmuEnd
@@ -13,7 +11,6 @@ from .wire import MEMORY, NO_ROOM, OUTPUT
 
 _BY_US = -int(getattr(signal, "SIGKILL", signal.SIGTERM))
 _NEARLY = 0.8  # part of the memory that counts as all of it
-SKIPPED = {"sources", "documentation"}
 
 
 def read_end(
@@ -59,31 +56,3 @@ def describe_memory(pid: int | None, limit: int) -> str:
         f" Its process has {used / 1e6:.6g} of {limit / 1e6:.6g} MB of memory, so that it may have got no more: raise "
         "the limit by isolate=Isolation(memory=…)."
     )
-
-
-def count_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def copy_files(source: Path, target: Path) -> None:
-    """Copy the files of an FMU that its library may read or write: sources and documentation are left out.
-
-    An `OSError` is that of the first file: that of shutil lists the texts of all.
-    """
-    faults: list[OSError] = []
-
-    def copy(one: str, other: str) -> None:
-        try:
-            shutil.copy2(one, other)
-        except OSError as error:
-            faults.append(error)
-            raise
-
-    def skip(where: str, names: Sequence[str]) -> set[str]:
-        return SKIPPED & {*names} if where == str(source) else set()
-
-    try:
-        shutil.copytree(source, target, ignore=skip, copy_function=copy)
-    except shutil.Error as error:
-        raise (faults or [error])[0] from error

@@ -1,4 +1,4 @@
-"""A child process that holds an FMU's library, seen from this process: requests, watchdog, end."""
+"""A child process that holds an FMU's library, seen from this process: requests, messages, watchdog, end."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import json
 import mmap
 import os
 import select
+import shutil
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -21,14 +22,27 @@ import numpy as np
 from ...blocks.core import FmuEnd, FmuError, FmuProcessError, describe_disk_error
 from ..child_processes import ProcessGroup, find_python, make_temporary_folder, remove_folder
 from . import wire
-from .end_reasons import copy_files, count_cores, read_end
-from .output import ChildOutput
-from .wire import CAUSE, CHILD_SLEEPS, DATA, MAIL, MESSAGES, PARENT_SLEEPS, PLACE, REPLY, REQUEST, SEQUENCE, STATUS
+from .end_reasons import read_end
+from .wire import (
+    CAUSE,
+    CHILD_SLEEPS,
+    DATA,
+    LOG_HEAD,
+    MAIL,
+    MESSAGES,
+    PARENT_SLEEPS,
+    PLACE,
+    REPLY,
+    REQUEST,
+    SEQUENCE,
+    STATUS,
+)
 
 _START = (
     "import sys, types; sys.path[:] = [p for p in sys.path if p]; m = types.ModuleType('loopwright_child'); "
     "m.__path__ = sys.argv[1:2]; sys.modules[m.__name__] = m; from loopwright_child.child import main; main()"
 )
+_SKIPPED = {"sources", "documentation"}  # folders of an FMU that its library needs not
 _LOOKS = 2000
 _LOOK = 0.05  # s between two looks at a process that does not answer
 _LOADING = 60.0  # s to load a small library of ours
@@ -64,7 +78,7 @@ class ChildProcess:
         self._peak = 0
         self._output = ChildOutput(self.folder)
         self.number, self._allotted = 0, DATA
-        self._watches = wire.ORDERED and count_cores() > 1
+        self._watches = wire.ORDERED and _count_cores() > 1
         self.patience = wire.Patience(_LOOKS, may=self._watches)
         self._names: list[list[str]] = []
         self._call = ""
@@ -81,7 +95,7 @@ class ChildProcess:
             raise
 
     def _spawn(self, files: Path) -> None:
-        copy_files(files, self.folder / "fmu")
+        _copy_files(files, self.folder / "fmu")
         (self.folder / "work").mkdir()
         shared = self.folder / "shared"
         with shared.open("wb") as file:
@@ -385,6 +399,74 @@ class ChildProcess:
         self.take_message, self.lose = lambda status, text: None, lambda error: error
         self._output.begin_again()
         self.words[MESSAGES] = 0
+
+
+_LAST_LINES = 5
+
+
+class ChildOutput:
+    """Files of a child: ``log`` and ``printed`` in its folder."""
+
+    def __init__(self, folder: Path):
+        self.folder, self._position, self._printed = folder, 0, 0
+
+    def begin_again(self) -> None:
+        """Forget what has been printed so far."""
+        with suppress(OSError):
+            self._printed = (self.folder / "printed").stat().st_size
+
+    def read_messages(self) -> Iterator[tuple[int, str]]:
+        """Yield status and text of each log message that hasn't been read yet."""
+        data = b""
+        with suppress(OSError), open(self.folder / "log", "rb") as file:
+            file.seek(self._position)
+            data = file.read()
+        at = 0
+        while at + LOG_HEAD.size <= len(data):
+            status, n = LOG_HEAD.unpack_from(data, at)
+            start = at + LOG_HEAD.size
+            if start + n > len(data):
+                break
+            at = start + n
+            self._position += LOG_HEAD.size + n
+            yield status, data[start:at].decode(errors="replace")
+
+    def read_printed(self) -> list[str]:
+        """Return the last lines that the FMU has written to its standard output and standard error."""
+        with suppress(OSError), open(self.folder / "printed", "rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - 4096, self._printed if self._printed <= size else 0))  # it may have begun again
+            lines = file.read().decode(errors="replace").splitlines()
+            return [line.strip() for line in lines if line.strip()][-_LAST_LINES:]
+        return []
+
+
+def _count_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _copy_files(source: Path, target: Path) -> None:
+    """Copy the files of an FMU that its library may read or write: sources and documentation are left out.
+
+    An `OSError` is that of the first file: that of shutil lists the texts of all.
+    """
+    faults: list[OSError] = []
+
+    def copy(one: str, other: str) -> None:
+        try:
+            shutil.copy2(one, other)
+        except OSError as error:
+            faults.append(error)
+            raise
+
+    def skip(where: str, names: Sequence[str]) -> set[str]:
+        return _SKIPPED & {*names} if where == str(source) else set()
+
+    try:
+        shutil.copytree(source, target, ignore=skip, copy_function=copy)
+    except shutil.Error as error:
+        raise (faults or [error])[0] from error
 
 
 def _make_poll(pipe: int) -> Any:

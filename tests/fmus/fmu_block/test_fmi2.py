@@ -22,7 +22,7 @@ from loopwright.fmus import (
     mass_spring_damper,
     read_description,
 )
-from loopwright.fmus.isolation.printf import Logger, format_message
+from loopwright.fmus.isolation.callbacks import Logger, format_message
 from support.plants import run
 
 T = 1e-3

@@ -1,17 +1,88 @@
-"""Model exchange as a description states it: capabilities, states, event indicators, dependencies."""
+"""Interfaces of an FMU as its description states them: capabilities, dependencies, co-simulation, model exchange.
+
+Versions of FMI name the flags differently.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from .capabilities import has_flag, read_capabilities
-from .feedthrough import Dependencies, Key, key_of, read_dependencies
-from .variables import FmuVariable
+from .variables import FmuVariable, fmi3_type
+
+Key = tuple[str, int]
+"""Type, as FMI 3.0 names it, and value reference of a variable."""
+Dependencies = Mapping[Key, frozenset[Key] | None]
+"""For each unknown, the variables that it depends on; None: it doesn't say, so all."""
+
+
+def key_of(variable: Any) -> Key:
+    """Return the key of a variable that FMPy has read."""
+    return fmi3_type(variable.type), int(variable.valueReference)
+
+
+def read_dependencies(unknowns: Iterable[Any]) -> dict[Key, frozenset[Key] | None]:
+    """Return the variables that each unknown of a model structure depends on, from FMPy's reading of it."""
+    return {
+        key_of(unknown.variable): None if unknown.dependencies is None else frozenset(map(key_of, unknown.dependencies))
+        for unknown in unknowns
+    }
+
+
+def has_flag(interface: Any, name: str) -> bool:
+    """Whether an element of a description has a flag; not where there is no such element."""
+    return interface is not None and interface.get(name) in ("true", "1")
+
+
+def state_flags(version: str) -> tuple[str, str]:
+    """Return the names of the flags of saving and of serializing the state."""
+    state = "FMUState" if version.startswith("3.") else "FMUstate"
+    return f"canGetAndSet{state}", f"canSerialize{state}"
+
+
+def derivatives_flag(version: str) -> str:
+    """Return the name of the flag of directional derivatives."""
+    return "providesDirectionalDerivatives" if version.startswith("3.") else "providesDirectionalDerivative"
+
+
+def read_capabilities(interface: Any, version: str) -> dict[str, bool]:
+    """Return the capabilities that both interfaces have, co-simulation and model exchange, by the names of fields."""
+    saves, serializes = state_flags(version)
+    return {
+        "can_save": has_flag(interface, saves),
+        "can_serialize": has_flag(interface, saves) and has_flag(interface, serializes),
+        "has_derivatives": has_flag(interface, derivatives_flag(version)),
+        "only_once": has_flag(interface, "canBeInstantiatedOnlyOncePerProcess"),
+    }
+
+
+def read_co_simulation(root: Any, version: str) -> dict[str, Any]:
+    """Return the capabilities of co-simulation (FMI 2.0, 4.3.1; FMI 3.0, 4.4), some of which FMPy drops."""
+    steps = root.find("Implementation//Capabilities" if version == "1.0" else "CoSimulation")
+    two = not version.startswith("3.")
+    fixed = None if steps is None or two else steps.get("fixedInternalStepSize")
+    experiment = root.find("DefaultExperiment")
+    return {
+        **read_capabilities(steps, version),
+        "has_event_mode": has_flag(steps, "hasEventMode"),
+        "interpolates_inputs": has_flag(steps, "canInterpolateInputs" if two else "providesIntermediateUpdate"),
+        "variable_step": has_flag(steps, "canHandleVariableCommunicationStepSize"),
+        "fixed_internal_step": None if fixed is None else float(fixed),
+        "stop_time": None if experiment is None else _number(experiment.get("stopTime")),
+        "step_size": None if experiment is None else _number(experiment.get("stepSize")),
+    }
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return None
 
 
 @dataclass(frozen=True, eq=False)
