@@ -13,7 +13,7 @@ from .block import Block
 from .errors import ParameterError, ShapeError
 from .numpy_functions import Units, follow_entries, multiply_units
 from .ports import Input, Output, PortUnit, Shape, number_inputs
-from .units import same_unit
+from .units import common_unit, is_uncertain, same_unit, sum_unit
 from .values import Array, parameter
 
 
@@ -51,7 +51,9 @@ class Sum(Block):
     """Sum with signs: y = ± u₁ ± u₂ ….
 
     Inputs ``u1``, ``u2``, …, one for each sign, have one shape and unit (a scalar goes with any shape). The output
-    ``y`` has the same.
+    ``y`` has the same, but for temperatures in °C: one less another is a difference, in K, and one with a difference is
+    a temperature. What has no unit counts as a difference where it is added. Of other sums, such as that of two
+    temperatures, the unit is not known.
 
     Raises
     ------
@@ -69,7 +71,7 @@ class Sum(Block):
             "a + or - for each input, such as '+-'", "Give one for each."
         ),
     )
-    y = Output(like="u1")
+    y = Output(shape=None, description="the sum")
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
@@ -83,6 +85,20 @@ class Sum(Block):
         for sign, value in zip(self.signs[1:], u[1:], strict=True):
             total = total + value if sign == "+" else total - value
         return total
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit of the sum."""
+        signs = [1 if sign == "+" else -1 for sign in self.signs]
+        count = next((len(unit) for unit in units.values() if isinstance(unit, tuple)), None)
+        if count is None:
+            plain = [unit if isinstance(unit, str) else None for unit in units.values()]
+            return {"y": sum_unit(*zip(plain, signs, strict=True))}
+        entries = [unit if isinstance(unit, tuple) else (unit,) * count for unit in units.values()]
+        if any(len(entry) != count for entry in entries):
+            return {}
+        found = [sum_unit(*zip(entry, signs, strict=True)) for entry in zip(*entries, strict=True)]
+        known = tuple(unit for unit in found if unit is not None)
+        return {"y": known} if len(known) == count else {}
 
 
 class Gain(Block):
@@ -147,7 +163,7 @@ class Stack(Block):
     """Vector of the entries of its inputs, in a row; other tools call it a mux.
 
     A tuple or a list of signals in a call makes one: ``observer((u, y))`` is ``observer(Stack()(u, y))``.
-    `Demux` is its reverse.
+    `Demux` is its reverse. The output has the unit that its inputs have in common, or one for each entry.
 
     Inputs ``u1``, ``u2``, … are scalars or vectors. The output ``y`` has as many entries as all of them together. With
     ``rows=True``, as ``np.stack`` makes it, vectors are the rows of a matrix, and scalars the entries of a vector.
@@ -158,6 +174,7 @@ class Stack(Block):
         For a matrix as input, and for rows of different shapes, when the diagram is built.
     """
 
+    units_by_entry = True
     count: int = parameter(default=2, minimum=1, description="number of inputs")
     rows: bool = parameter(default=False, description="True for one row of a matrix by each vector")
     y = Output(shape=None, description="the entries of all inputs")
@@ -185,10 +202,18 @@ class Stack(Block):
         return np.concatenate([value if shape_of(value) else np.stack([value]) for value in u])
 
     def output_units(self, units: Units) -> Mapping[str, PortUnit]:
-        """Return the unit that all entries have."""
-        first = units["u1"]
-        alike = isinstance(first, str) and all(isinstance(u, str) and same_unit(u, first) for u in units.values())
-        return {"y": first} if alike else {}
+        """Return the unit that all entries have, else one for each."""
+        if any(unit is None for unit in units.values()):
+            return {}
+        entries = [
+            e for unit in units.values() if unit is not None for e in ((unit,) if isinstance(unit, str) else unit)
+        ]
+        alike = all(same_unit(entry, entries[0]) for entry in entries)
+        common = common_unit(*entries) if alike else None  # uncertain, if some are differences
+        if common is not None and (not is_uncertain(common) or any(map(is_uncertain, entries))):
+            return {"y": common}
+        sized = all(isinstance(unit, tuple) for unit in units.values())
+        return {"y": tuple(entries) if sized and not (self.rows and len(entries) > self.count) else common}
 
 
 Mux = Stack

@@ -131,6 +131,8 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
     same_units: ClassVar[bool | tuple[str, ...]] = False
     """True where all inputs must be in one unit, as in a sum; or the names of those that must, as of a set-point and
     a measured value."""
+    units_by_entry: ClassVar[bool] = False
+    """True where `output_units` gets a tuple, one unit for each entry, of each input whose shape is known."""
     converts_units: ClassVar[bool | None] = None
     """True where a wire to or from the block is converted if its ends are in different units of one dimension; False
     where the block's user could ask for that."""

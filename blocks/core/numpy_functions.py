@@ -14,7 +14,15 @@ import numpy as np
 
 from .errors import UnitError
 from .frozen import FrozenMapping, freeze
-from .units import combine_units, describe_mismatch, root_unit, same_unit
+from .units import (
+    combine_units,
+    common_unit,
+    describe_mismatch,
+    difference_unit,
+    root_unit,
+    same_unit,
+    uncertain_unit,
+)
 from .values import identity
 
 Units = Mapping[str, str | tuple[str, ...] | None]
@@ -83,7 +91,19 @@ def _alike(units: Mapping[str, str], name: str) -> str | None:
         if not same_unit(other, unit):
             step = describe_mismatch(other, unit)
             raise UnitError(f"expected {unit} as {first} is, as np.{name} takes like units: {step}", port=port)
-    return unit
+    return common_unit(*units.values())
+
+
+def _difference(units: Mapping[str, str], name: str) -> str | None:
+    """Return the unit of a difference of operands, which are in one unit."""
+    unit = _alike(units, name)
+    return None if unit is None else difference_unit(unit)
+
+
+def _of_several(units: Mapping[str, str], name: str) -> str | None:
+    """Return the unit of a sum of operands, which are in one unit; how many they are is not known."""
+    unit = _alike(units, name)
+    return None if unit is None else uncertain_unit(unit)
 
 
 def _of_angle(units: Mapping[str, str], name: str) -> str | None:
@@ -154,7 +174,7 @@ _ENTRYWISE: dict[Any, Rule] = {
     np.degrees: _converted("rad", "deg"),
     np.rad2deg: _converted("rad", "deg"),
     np.arctan2: _angle_of_two,
-    np.hypot: _alike,
+    np.hypot: _of_several,
     np.absolute: _alike,
     np.fabs: _alike,
 }
@@ -176,8 +196,10 @@ _AS_A_WHOLE: dict[Any, Rule] = {
     np.prod: _unknown,
     np.polyval: _unknown,
 }
-_AS_A_WHOLE |= dict.fromkeys((np.sum, np.mean, np.average, np.max, np.min, np.amax, np.amin, np.ptp, np.median), _alike)
-_AS_A_WHOLE |= dict.fromkeys((np.std, np.linalg.norm, np.trace, np.cumsum, np.diff, np.flip, np.roll, np.sort), _alike)
+_AS_A_WHOLE |= dict.fromkeys((np.mean, np.average, np.max, np.min, np.amax, np.amin, np.median), _alike)
+_AS_A_WHOLE |= dict.fromkeys((np.sum, np.cumsum, np.trace, np.linalg.norm), _of_several)
+_AS_A_WHOLE |= dict.fromkeys((np.std, np.ptp, np.diff), _difference)
+_AS_A_WHOLE |= dict.fromkeys((np.flip, np.roll, np.sort), _alike)
 _AS_A_WHOLE |= dict.fromkeys((np.reshape, np.ravel, np.transpose, np.squeeze, np.repeat, np.tile, np.diag), _alike)
 _AS_A_WHOLE |= dict.fromkeys((np.stack, np.concatenate, np.vstack, np.column_stack), _alike)
 RULES: Mapping[Any, Rule] = {**_ENTRYWISE, **_AS_A_WHOLE}

@@ -37,8 +37,9 @@ class Unit:
         Exponents of kg, m, s, A, K, mol, cd, rad.
     factor, offset : float
         Conversion to base units.
-    relative : bool
-        Whether numbers in it are differences, for which no offset counts (FMI's ``relativeQuantity``).
+    relative : bool or None
+        Whether numbers in it are differences, for which no offset counts (FMI's ``relativeQuantity``); None where that
+        is not known, as of the sum of two temperatures.
     loose_angle : bool
         Whether the exponent of rad is not known: tools define angles with and without it.
     """
@@ -47,7 +48,7 @@ class Unit:
     exponents: tuple[int, ...]
     factor: float = 1.0
     offset: float = 0.0
-    relative: bool = False
+    relative: bool | None = False
     loose_angle: bool = False
 
     @property
@@ -227,9 +228,18 @@ def _offsets(a: Unit, b: Unit) -> tuple[float, float]:
     return (0.0, 0.0) if a.relative or b.relative else (a.offset, b.offset)
 
 
+def _is_open(a: Unit, b: Unit) -> bool:
+    """Whether an offset lies between the two, and it isn't known whether it counts."""
+    return (a.relative is None or b.relative is None) and not math.isclose(*_offsets(a, b))
+
+
 def same_dimension(a: Unit | str, b: Unit | str) -> bool:
     """Whether numbers in ``a`` can be converted to ``b``."""
     a, b = _read(a), _read(b)
+    return _same_exponents(a, b) and not _is_open(a, b)
+
+
+def _same_exponents(a: Unit, b: Unit) -> bool:
     n = len(BASE_UNITS) - 1 if a.loose_angle or b.loose_angle else len(BASE_UNITS)  # rad is the last one
     return a.exponents[:n] == b.exponents[:n]
 
@@ -255,6 +265,14 @@ def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
     a, b = _read(a), _read(b)
     if same_unit(a, b):
         return f"{a.text} and {b.text} are the same"
+    if _same_exponents(a, b) and _is_open(a, b):
+        unclear, other = (a, b) if a.relative is None else (b, a)
+        return (
+            f"{unclear.text} and {other.text} differ by an offset for temperatures, and by none for differences, and "
+            "the signal may be either (as a sum of two temperatures, or one less a number without a unit): give all "
+            f"that is added a unit, or put UnitConversion(from_unit={a.text!r}, to_unit={b.text!r}) between if it is a "
+            "temperature"
+        )
     if not same_dimension(a, b):
         both = f"{a.text} ({a.base_text}) and {b.text} ({b.base_text})"
         return f"{both} are of different dimensions: check which ports are meant"
@@ -283,6 +301,57 @@ def combine_units(*factors: tuple[str, int]) -> str | None:
     if not loose and not any(isinstance(factor, DefinedUnit) for factor, _ in factors):
         return text
     return DefinedUnit(replace(made, loose_angle=loose))
+
+
+def difference_unit(text: str) -> str:
+    """Return the unit of the difference of two numbers: ``K`` for ``degC``, and the same one without an offset."""
+    unit = parse_unit(text)
+    if not unit.offset or unit.relative:
+        return text
+    kelvin = unit.factor == 1.0 and unit.exponents == parse_unit("K").exponents
+    return DefinedUnit(
+        replace(unit, text="K" if kelvin else unit.text, offset=0.0 if kelvin else unit.offset, relative=True)
+    )
+
+
+def uncertain_unit(text: str) -> str:
+    """Return the unit of a number of which it is not known whether it is a difference, as of a sum of temperatures."""
+    unit = parse_unit(text)
+    return DefinedUnit(replace(unit, relative=None)) if unit.offset and not unit.relative else text
+
+
+def is_uncertain(text: str) -> bool:
+    """Whether it is not known of numbers in a unit whether they are differences."""
+    return parse_unit(text).relative is None
+
+
+def common_unit(*texts: str) -> str:
+    """Return the unit of what is one of several numbers in like units: uncertain if only some are differences."""
+    absolute = [text for text in texts if (unit := parse_unit(text)).offset and not unit.relative]
+    if not absolute or len(absolute) == len(texts):
+        return next((text for text in texts if is_uncertain(text)), texts[0])
+    return uncertain_unit(absolute[0])
+
+
+def sum_unit(*terms: tuple[str | None, int]) -> str | None:
+    """Return the unit of a sum of numbers in like units, each with its sign, 1 or -1.
+
+    It is that of the first term, but for units with an offset: a temperature less another is a difference, in K, and a
+    temperature and a difference are a temperature. What has no unit and is added to a temperature counts as a
+    difference. Of other sums, such as that of two temperatures, it is not known what they are.
+    """
+    first = terms[0][0]
+    absolute = [(t, sign) for t, sign in terms if t is not None and (u := parse_unit(t)).offset and not u.relative]
+    if not absolute:
+        return first
+    unit, count = absolute[0][0], sum(sign for _, sign in absolute)
+    unknown = [sign for text, sign in terms if text is None]
+    if not any(is_uncertain(text) for text, _ in absolute):
+        if count == 1 and -1 not in unknown:
+            return unit
+        if count == 0 and not unknown:
+            return difference_unit(unit)
+    return None if first is None else uncertain_unit(unit)
 
 
 def root_unit(text: str, degree: int) -> str | None:

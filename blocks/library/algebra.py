@@ -17,11 +17,12 @@ from ..core import (
     Units,
     check_shapes,
     clip,
+    difference_unit,
     parameter,
     raise_unit,
     shorten,
 )
-from .branching import NumberedInputs
+from .branching import NumberedInputs, unit_of_one
 
 
 class Minimum(NumberedInputs):
@@ -34,11 +35,15 @@ class Minimum(NumberedInputs):
     """
 
     same_units = True
-    y = Output(like="u1", description="the smallest")
+    y = Output(shape=None, description="the smallest")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the smallest."""
         return self.fold(u, lambda a, b: np.where(a < b, a, np.where(b <= a, b, a + b)))
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit that the inputs have."""
+        return {"y": unit_of_one(*units.values())}
 
 
 class Maximum(NumberedInputs):
@@ -51,11 +56,15 @@ class Maximum(NumberedInputs):
     """
 
     same_units = True
-    y = Output(like="u1", description="the largest")
+    y = Output(shape=None, description="the largest")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the largest."""
         return self.fold(u, lambda a, b: np.where(a > b, a, np.where(b >= a, b, a + b)))
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit that the inputs have."""
+        return {"y": unit_of_one(*units.values())}
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -124,6 +133,11 @@ class Limited(Block):
         check_shapes(**given, u=u)
         return clip(u, self.lower, self.upper) if self.limit is None else clip(u, -self.limit, self.limit)
 
+    def part_units(self, port: str, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit of an output that is the part of the signal beyond the limits: K for °C."""
+        unit = units["u"]
+        return {port: tuple(map(difference_unit, unit)) if isinstance(unit, tuple) else unit and difference_unit(unit)}
+
 
 class Saturation(Limited):
     """Saturation: y = u limited to ±limit, or to [lower, upper], element by element; NaN passes through.
@@ -140,12 +154,16 @@ class Saturation(Limited):
     """
 
     y = Output(like="u", description="the limited signal")
-    excess = Output(like="u", secondary=True, description="the part cut off, u − y")
+    excess = Output(shape=None, secondary=True, description="the part cut off, u − y")
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the limited signal and the part cut off."""
         y = self.limited(u.u)
         return y, u.u - y
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit of the part cut off."""
+        return self.part_units("excess", units)
 
 
 class DeadZone(Limited):
@@ -161,8 +179,12 @@ class DeadZone(Limited):
         For limits and a signal of different shapes, when the diagram is built.
     """
 
-    y = Output(like="u", description="the part beyond the limits")
+    y = Output(shape=None, description="the part beyond the limits")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the part beyond the limits."""
         return u.u - self.limited(u.u)
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit of the part beyond the limits."""
+        return self.part_units("y", units)

@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Input, ShapeError, check_shapes, number_inputs, parameter, shape_of
+from ..core import (
+    Array,
+    Block,
+    Input,
+    PortUnit,
+    ShapeError,
+    check_shapes,
+    common_unit,
+    number_inputs,
+    parameter,
+    shape_of,
+)
 
 
 def check_fits(value: Array, port: str, main: Array, main_port: str) -> None:
@@ -35,6 +46,18 @@ def expect_scalar(value: Array, port: str) -> Array:
             port=port,
         )
     return value
+
+
+def unit_of_one(*units: PortUnit) -> PortUnit:
+    """Return the unit of a signal that is one of several in like units, None for those without one."""
+    known = [unit for unit in units if unit is not None]
+    count = next((len(unit) for unit in known if isinstance(unit, tuple)), None)
+    if len(known) < 2:
+        return known[0] if known else None
+    if count is None:
+        return common_unit(*(unit for unit in known if isinstance(unit, str)))
+    entries = [unit if isinstance(unit, tuple) else (unit,) * count for unit in known]
+    return tuple(common_unit(*each) for each in zip(*entries, strict=False))
 
 
 class NumberedInputs(Block):

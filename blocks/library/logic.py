@@ -25,7 +25,7 @@ from ..core import (
     kinds,
     parameter,
 )
-from .branching import NumberedInputs, check_fits, expect_scalar, truth
+from .branching import NumberedInputs, check_fits, expect_scalar, truth, unit_of_one
 from .initial_values import StartsAtInput
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}
@@ -190,7 +190,7 @@ class Switch(Block):
     condition = Input(shape=None, description="logic signal")
     then = Input(shape=None, description="output while the condition is true, of any shape")
     otherwise = Input(shape=None, description="output while it is not, of the same shape or a scalar")
-    y = Output(like="then", description="one of the two")
+    y = Output(shape=None, description="one of the two")
     change = Event("both", "the condition crosses 0.5")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -201,7 +201,7 @@ class Switch(Block):
 
     def output_units(self, units: Units) -> Mapping[str, PortUnit]:
         """Return the unit that both branches have."""
-        return {"y": units["otherwise"] if units["then"] is None else units["then"]}
+        return {"y": unit_of_one(units["then"], units["otherwise"])}
 
     def indicators(self, t: Array, x: Any, u: Any) -> Array:
         """Return the distance of the condition above 0.5."""

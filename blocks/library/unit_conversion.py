@@ -7,7 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, PortUnit, UnitError, convert_unit, parameter
+from ..core import (
+    Array,
+    Block,
+    Input,
+    Output,
+    ParameterError,
+    PortUnit,
+    UnitError,
+    Units,
+    convert_unit,
+    parameter,
+    parse_unit,
+    shorten,
+)
 
 
 class UnitConversion(Block):
@@ -17,6 +30,8 @@ class UnitConversion(Block):
     ------
     ParameterError
         For units of different dimensions, and for those that can't be read.
+    UnitError
+        For a difference of temperatures where the conversion adds an offset, when the diagram is built.
 
     Examples
     --------
@@ -68,6 +83,18 @@ class UnitConversion(Block):
     def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
         """The signal in the other unit."""
         return {"y": Output(shape=None, unit=self.to_unit, description="the signal in the other unit", name="y")}
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Refuse a difference of temperatures where the conversion adds an offset: 5 °C of difference are 5 K."""
+        unit, offset = units["u"], np.any(self.law[1])
+        entries = unit if isinstance(unit, tuple) else () if unit is None else (unit,)
+        if offset and any(parse_unit(entry).relative for entry in entries):
+            raise UnitError(
+                f"expected a temperature, as the conversion to {self.to_unit} adds {shorten(self.law[1])}, and found a "
+                "difference of two: wire it without the conversion",
+                port="u",
+            )
+        return {}
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the signal in the other unit."""

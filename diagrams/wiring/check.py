@@ -43,7 +43,7 @@ def check(table: Structure) -> Checked:
     traced, shapes = _infer_shapes(table)
     _check_subsystems(table, traced, shapes)
     _check_stops(table, shapes)
-    return Checked(traced, shapes, check_units(table))
+    return Checked(traced, shapes, check_units(table, shapes))
 
 
 def part_shape(shape: Shape, wire: Wire, consumer: str, port: str) -> Shape:

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
+from typing import Any
 
-from ...blocks.core import Block, PortUnit, UnitError, describe_mismatch, same_dimension, same_unit
+from ...blocks.core import (
+    Block,
+    PortUnit,
+    Shape,
+    UnitError,
+    describe_mismatch,
+    is_uncertain,
+    parse_unit,
+    same_dimension,
+    same_unit,
+)
 from ...blocks.library import UnitConversion
 from .structure import Structure, Wire, join
 
 Unit = PortUnit
 Port = tuple[str, str]
 _MOST_ROUNDS = 100
+_MOST_CHANGES = 8
+"""Changes of an output's unit while those of a loop of sums follow from each other."""
 
 
-def follow_units(table: Structure, converted: Mapping[Port, Unit]) -> dict[Port, Unit]:
+def follow_units(
+    table: Structure, converted: Mapping[Port, Unit], shapes: Mapping[Port, Shape] | None = None
+) -> dict[Port, Unit]:
     """Return the unit of every output that has one: declared, or that of the input which the output is like."""
-    # ``converted``: units to which wires are converted, by the input at their end.
+    # ``converted``: units to which wires are converted, by the input at their end; ``shapes``: of outputs, if known.
     units: dict[Port, Unit] = {}
     for path, block in table.blocks.items():
         for name, port in block.outputs.items():
@@ -34,26 +50,38 @@ def follow_units(table: Structure, converted: Mapping[Port, Unit]) -> dict[Port,
         for name in table.blocks[path].inputs:
             if (wire := table.wires.get((path, name))) is not None:
                 rules.setdefault((wire.block, wire.port), []).append(path)
-    waiting = list(units)
+    waiting, changes = list(units), dict.fromkeys(units, _MOST_CHANGES)  # a declared unit stays
+
+    def put(output: Port, unit: Unit) -> None:
+        """Note a unit, which may differ from that before: a difference is known only with both of its ends."""
+        if changes.get(output, 0) < _MOST_CHANGES and _identity(unit) != _identity(units.get(output)):
+            changes[output] = changes.get(output, 0) + 1
+            if unit is None:
+                del units[output]
+            else:
+                units[output] = unit
+            waiting.append(output)
+
     while waiting:
         source = waiting.pop()
         for path in rules.get(source, ()):
             with suppress(UnitError):  # check_units raises it
-                for name, unit in table.blocks[path].output_units(_input_units(table, units, converted, path)).items():
-                    if unit is not None and (path, name) not in units:
-                        units[path, name] = unit
-                        waiting.append((path, name))
+                inputs = _input_units(table, units, converted, path, shapes)
+                for name, unit in table.blocks[path].output_units(inputs).items():
+                    put((path, name), unit)
         for output, end, wire in followers.get(source, ()):
-            unit = converted.get(end) or _part_unit(units, wire)
-            if unit is not None:
-                units[output] = unit
-                waiting.append(output)
+            put(output, converted.get(end) or _part_unit(units, wire))
     return units
 
 
-def check_units(table: Structure) -> dict[Port, Unit]:
-    """Return the units of all outputs that have one."""
-    units = follow_units(table, {})
+def _identity(unit: Unit) -> Any:
+    """Return what differs between two units: their names may be the same, as of kelvins and differences in K."""
+    return tuple(map(parse_unit, unit)) if isinstance(unit, tuple) else unit and parse_unit(unit)
+
+
+def check_units(table: Structure, shapes: Mapping[Port, Shape]) -> dict[Port, Unit]:
+    """Check the units at the ends of all wires, and return those of all outputs that have a certain one."""
+    units = follow_units(table, {}, shapes)
     for path, block in sorted(table.blocks.items()):
         first: tuple[Wire, Unit] | None = None
         inputs = block.inputs
@@ -81,12 +109,16 @@ def check_units(table: Structure) -> dict[Port, Unit]:
                 )
     for path in _with_rules(table):
         try:
-            table.blocks[path].output_units(_input_units(table, units, {}, path))
+            table.blocks[path].output_units(_input_units(table, units, {}, path, shapes))
         except UnitError as error:
             wire = table.wires[path, str(error.port)]
             error.message = f"{wire} is in {_text(_part_unit(units, wire))}; {error.message}"
             raise error.blame(path) from None
-    return units
+    return {port: unit for port, unit in units.items() if not any(map(is_uncertain, _entries(unit)))}
+
+
+def _entries(unit: Unit) -> tuple[str, ...]:
+    return unit if isinstance(unit, tuple) else () if unit is None else (unit,)
 
 
 def _with_rules(table: Structure) -> Iterator[str]:
@@ -95,14 +127,28 @@ def _with_rules(table: Structure) -> Iterator[str]:
 
 
 def _input_units(
-    table: Structure, units: Mapping[Port, Unit], converted: Mapping[Port, Unit], path: str
+    table: Structure,
+    units: Mapping[Port, Unit],
+    converted: Mapping[Port, Unit],
+    path: str,
+    shapes: Mapping[Port, Shape] | None,
 ) -> dict[str, Unit]:
     """Return the unit of each input of a block, None where it is not known."""
     wires = {name: table.wires.get((path, name)) for name in table.blocks[path].inputs}
-    return {
+    found = {
         name: converted.get((path, name)) or (None if wire is None else _part_unit(units, wire))
         for name, wire in wires.items()
     }
+    if shapes is not None and table.blocks[path].units_by_entry:
+        for name, unit in found.items():
+            wire = wires[name]
+            if (
+                isinstance(unit, str)
+                and wire is not None
+                and (shape := shapes.get((wire.block, wire.port))) is not None
+            ):
+                found[name] = (unit,) * math.prod(shape if wire.index is None else wire.entries(shape).shape)
+    return found
 
 
 def add_unit_conversions(table: Structure) -> Structure:

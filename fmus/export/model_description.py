@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from ...blocks.core import parse_unit
 from .dependencies import Dependency, dependencies, reinitialized_states
 from .model_spec import ModelSpec, naming_convention
 from .quantities import quantity, type_names
@@ -59,6 +60,7 @@ class DescribedVariable:
         return {
             "declaredType": types.get(v.unit or ""),
             "unit": v.unit,
+            "relativeQuantity": True if v.unit is not None and parse_unit(v.unit).relative else None,
             "min": None if v.minimum is None else float(v.minimum),
             "max": None if v.maximum is None else float(v.maximum),
             "nominal": None if v.nominal is None else float(v.nominal),

@@ -8,14 +8,17 @@ from loopwright.blocks.core.errors import UnitError
 from loopwright.blocks.core.units import (
     Unit,
     combine_units,
+    common_unit,
     convert_unit,
     describe_mismatch,
+    difference_unit,
     parse_unit,
     print_unit,
     raise_unit,
     rate_of,
     root_unit,
     same_unit,
+    sum_unit,
     with_unit,
 )
 
@@ -166,6 +169,40 @@ def test_units_that_have_no_product_or_root():
     assert combine_units(("degC", 1), ("W", 1)) is None
     assert root_unit("m.s2", 2) is None
     assert rate_of("N/(m/s)") == "N/m"
+
+
+@pytest.mark.parametrize(
+    ("terms", "text", "offset", "relative"),
+    [
+        ([("degC", 1), ("degC", -1)], "K", 0.0, True),
+        ([("degC", -1), ("degC", 1)], "K", 0.0, True),
+        ([("degC", 1), (difference_unit("degC"), -1)], "degC", 273.15, False),
+        ([("degC", 1), ("degC", -1), ("degC", 1)], "degC", 273.15, False),
+        ([(None, 1), ("degC", 1)], "degC", 273.15, False),
+        ([("degC", 1), (None, -1)], "degC", 273.15, None),
+        ([("degC", 1), ("degC", 1)], "degC", 273.15, None),
+        ([("degC", -1)], "degC", 273.15, None),
+        ([("m", 1), ("m", -1)], "m", 0.0, False),
+        ([("m", 1), (None, -1)], "m", 0.0, False),
+    ],
+)
+def test_a_sum_of_temperatures(terms, text, offset, relative):
+    unit = parse_unit(sum_unit(*terms))
+    assert (unit.text, unit.offset, unit.relative) == (text, offset, relative)
+
+
+def test_one_of_several_numbers_is_a_difference_only_if_all_are():
+    difference = difference_unit("degC")
+    found = [
+        parse_unit(common_unit(*units)).relative
+        for units in (("degC", "degC"), (difference,) * 2, ("degC", difference))
+    ]
+    assert found == [False, True, None]
+    assert sum_unit((None, 1), ("degC", -1)) is None
+    assert convert_unit("degC", difference) == (1.0, 0.0)
+    assert combine_units((difference, 1), ("W/K", 1)) == "W"
+    with pytest.raises(UnitError, match="may be either"):
+        convert_unit(sum_unit(("degC", 1), ("degC", 1)), "K")
 
 
 def test_power_with_an_angle_is_power_without_one():

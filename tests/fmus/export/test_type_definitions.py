@@ -7,7 +7,8 @@ import pytest
 from fmpy.validation import validate_fmu
 from lxml import etree
 
-from loopwright.blocks import Block, Input, State
+from loopwright.blocks import Block, Constant, Input, State, Sum
+from loopwright.diagrams import Diagram
 from loopwright.fmus import build, build_fmu, gantry
 from support.exported import pendulums
 
@@ -62,6 +63,19 @@ def test_types_and_variables_have_names_of_their_own(fmi):
     assert found["Force_"] == ("Force", "N")
     assert found["Force__"] == ("Force", "kN")  # the same quantity in another unit is another type
     assert found["Quantity in kg2.m/s"] == (None, "kg2.m/s")
+    assert validate_fmu(str(path)) == []
+
+
+@pytest.mark.parametrize("fmi", [3, 2])
+def test_a_difference_of_temperatures_is_a_relative_quantity(fmi):
+    warm = Constant(value=25.0, unit="degC", name="warm")
+    rise = Sum(signs="+-", name="rise")(warm, Constant(value=20.0, unit="degC", name="cold"))
+    path = build(Diagram("room", rise.named("rise")), fmi=fmi, outputs=["rise", "warm.y"])
+    with zipfile.ZipFile(path) as archive:
+        root = etree.fromstring(archive.read("modelDescription.xml"))
+    real = {v.get("name"): v if fmi == 3 else v.find("Real") for v in root.find("ModelVariables")}
+    found = [(real[name].get("unit"), real[name].get("relativeQuantity")) for name in ("rise", "warm.y")]
+    assert found == [("K", "true"), ("degC", None)]
     assert validate_fmu(str(path)) == []
 
 

@@ -3,7 +3,19 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, Block, Constant, Gain, Input, Output, Sine, Sum, UnitConversion, UnitError
+from loopwright.blocks import (
+    PID,
+    Block,
+    Constant,
+    Gain,
+    Input,
+    Output,
+    Saturation,
+    Sine,
+    Sum,
+    UnitConversion,
+    UnitError,
+)
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, mass_spring_damper
 from support.typed_fmus import typed_fmu
@@ -100,7 +112,7 @@ def test_outputs_are_converted_for_their_consumers_and_recorded_in_their_own_uni
     assert run["pid.u"][-1] == pytest.approx(30.0 - 26.85, rel=1e-12)
     assert run.unit("plant.y_T") == "K"
     assert run["difference.y"][-1] == pytest.approx(30.0 - 26.85, rel=1e-12)
-    assert run.unit("difference.y") == "degC"
+    assert run.unit("difference.y") == "K"
     assert run["mean.y"][-1] == pytest.approx(50.0 + (300.0 * 1.8 - 459.67), rel=1e-12)
 
 
@@ -122,6 +134,35 @@ def test_a_replacement_in_other_units_fits_if_it_converts(file):
     ][-1] == pytest.approx(np.pi / 2)
     with pytest.raises(UnitError, match="deg and rad"):
         diagram.replace(plant=Fmu(file))
+
+
+WARM, COLD = Constant(value=30.0, unit="degC", name="warm"), Constant(value=25.0, unit="degC", name="cold")
+
+
+@pytest.mark.parametrize(
+    ("port", "signal", "expected"),
+    [
+        ("T", WARM - COLD, 5.0),
+        ("F", WARM - COLD, 9.0),
+        ("rise", WARM - COLD, 5.0),
+        ("T", COLD + (WARM - COLD), 303.15),
+        ("T", COLD + 5.0, 303.15),
+        ("T", UnitConversion(from_unit="degC", to_unit="K")(COLD - 5.0), 293.15),
+        ("T", Saturation(upper=28.0)(WARM).excess, 2.0),
+    ],
+)
+def test_differences_of_temperatures_get_no_offset(file, port, signal, expected):
+    plant = Fmu(file, name="plant", convert_units=True)
+    run = Diagram("d", wired(plant, **{port: signal})).simulate(0.1, step=0.1, progress=False)
+    assert run[f"plant.y_{port}"][-1] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("signal", [WARM + COLD, COLD - 5.0, -COLD, np.maximum(WARM, WARM - COLD)])
+def test_what_may_be_a_temperature_or_a_difference_is_refused_where_that_counts(file, signal):
+    plant = Fmu(file, name="plant", convert_units=True)
+    with pytest.raises(UnitError, match="may be either .* put UnitConversion.from_unit='degC', to_unit='K'. between"):
+        Diagram("d", wired(plant, T=signal))
+    Diagram("d", wired(plant, rise=signal))  # a difference counts without an offset, whatever the signal is
 
 
 class Controller(Block):
