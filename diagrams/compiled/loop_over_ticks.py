@@ -266,7 +266,7 @@ class CompiledLoop:
             Steps of the plants that end at each of them, where not all plants step at all.
         """
         self.set_steps(steps)
-        with self.plants.guard(calls_python=self.calls_python):
+        with self.plants.guard():
             self._run(
                 ctypes.addressof(self.structure),
                 len(widths),

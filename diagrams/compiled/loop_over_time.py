@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -209,9 +208,6 @@ class CompiledHybrid:
         methods = [part for method in self.methods for part in (method.structure, method.kept)]
         return [*self.ticks.kept, *self._memory.kept, *self._equation.kept, *events, *methods]
 
-    def _guard(self) -> AbstractContextManager[None]:
-        return self.ticks.plants.guard(calls_python=self.ticks.calls_python)
-
     def note_taken(self, states: np.ndarray) -> None:
         """Note which states the tick renews that Python has just evaluated for C; see `CompiledLoop`."""
         first = self._taken_first[-2]
@@ -304,7 +300,7 @@ class CompiledHybrid:
         problem, method, n = hybrid.p, self.methods[hybrid.active].structure, hybrid.p.n
         where = self._equation.where
         lost, step = Lost(problem.lost), float(problem.beyond_t)
-        with self._guard():
+        with self.ticks.plants.guard():
             if lost is Lost.IN_STEP:
                 self._note_beyond(ctypes.byref(hybrid))
         beyond = None if lost is not Lost.IN_STEP or np.isnan(problem.beyond_t) else problem.beyond_t
@@ -381,7 +377,7 @@ class CompiledHybrid:
         delays = self._equation.delays
         if delays is not None:
             delays.hand_over(self._hybrid.t)
-        with self._guard():
+        with self.ticks.plants.guard():
             run(ctypes.byref(self._hybrid), ctypes.byref(given), ctypes.c_void_p(at(rows)), ctypes.byref(found))
         if delays is not None:
             delays.take_back()

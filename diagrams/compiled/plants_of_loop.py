@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 
 from ...blocks.interrupts import INTERRUPTS
@@ -117,26 +117,25 @@ class LoopPlants:
         if self.remote.by_python is not None:
             self.remote.by_python.check()
 
-    def guard(self, *, calls_python: bool) -> AbstractContextManager[None]:
+    def guard(self) -> AbstractContextManager[None]:
         """Leave this process's state as it was, whatever FMUs of others do to it meanwhile, and note their changes.
 
         C sets rounding mode and traps back after each step; the working folder is set back at the end. An interrupt
-        waits until C has returned where there are other processes, or C ``calls_python``.
+        waits until C has returned, as any loop may call Python: for a rare tick, for an algebraic loop, or as a log is
+        full.
         """
-        apart = any(remote.address for remote in self._remotes)
-        if self._watched or apart:
-            return self._guard(calls_python or apart)
-        return INTERRUPTS.kept() if calls_python else nullcontext()
+        if self._watched or any(remote.address for remote in self._remotes):
+            return self._guard()
+        return INTERRUPTS.kept()
 
     @contextmanager
-    def _guard(self, keeps_interrupts: bool) -> Iterator[None]:
+    def _guard(self) -> Iterator[None]:
         with ExitStack() as stack:
             for host, _ in self._watched:
                 stack.enter_context(host)
             for remote in self._remotes:
                 stack.enter_context(remote.guard())
-            if keeps_interrupts:
-                stack.enter_context(INTERRUPTS.kept())
+            stack.enter_context(INTERRUPTS.kept())
             yield
         for host, changed in self._watched:
             if changed:

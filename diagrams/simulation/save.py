@@ -16,8 +16,8 @@ SAME = 1e-6
 
 def can_save(engine: Engine) -> bool:
     """Whether the run is at a tick, none of its FMUs has ended it, and every one can turn its state into bytes."""
-    able = all(plant.can_serialize and not plant.failed for plant in engine.loaded.values())
-    return able and engine.position.end is None and not engine.ended_by
+    able, position = all(plant.can_serialize and not plant.failed for plant in engine.loaded.values()), engine.position
+    return able and position.end is None and not position.is_broken_off and not engine.ended_by
 
 
 def save_state(engine: Engine) -> RunState:
@@ -34,6 +34,8 @@ def save_state(engine: Engine) -> RunState:
             f"the run has ended at t = {position.t:g} s, between two ticks, and is not saved there. Save it at a tick.",
             block=engine.name,
         )
+    if position.is_broken_off:
+        raise broken_off_error(position.t, engine.name, "be saved there")
     return RunState(
         t=position.t,
         tick=position.tick,
@@ -49,6 +51,15 @@ def save_state(engine: Engine) -> RunState:
         proposed_step=None if engine.coupled is None else engine.coupled.proposed,
         fmus={path: plant.serialize() for path, plant in engine.loaded.items()},
         stopped=position.stopped,
+    )
+
+
+def broken_off_error(t: float, name: str, what: str) -> OptionError:
+    """Return the error of a run that has failed or was interrupted after a tick, so that it can't do something."""
+    return OptionError(
+        f"the run has failed, or was interrupted, on its way from t = {t:g} s, and can't {what}: its numbers may be those "
+        "of a later instant. Keep simulation.save() before such a part, and go back to it: simulation.restore(state).",
+        block=name,
     )
 
 

@@ -35,7 +35,7 @@ from .held_inputs import note_held_inputs
 from .live_run import FRAME, LiveRun, Pace
 from .progress import Interrupted, ProgressOption, compiler_notes, progress_bar
 from .run_options import RunOptions, default_step, refuse_rest, ticks_in
-from .save import can_save, restore_state, save_state
+from .save import broken_off_error, can_save, restore_state, save_state
 from .start_at_point import apply_point
 from .view import SimulationView, describe_simulation
 
@@ -225,7 +225,8 @@ class Simulation:
             See `Diagram.simulate`; ``error.run`` holds what was recorded until then.
         OptionError
             A duration that is not positive, or no multiple of the step where an FMU takes steps of one length
-            only; a run that has not begun, or has ended.
+            only; a run that has not begun, has ended, has failed or was interrupted (`restore` lets it continue from a
+            saved state).
         """
         self._refuse_second_driver()
         if not self._open:
@@ -242,11 +243,14 @@ class Simulation:
                 block=self.wired.name,
                 port="duration",
             )
+        if position.is_broken_off:
+            raise broken_off_error(position.t, self.wired.name, "continue from there")
         last = position.tick + count
         end = float(position.tick * self.flat.base + count * self.flat.base + rest) if rest else None
         started = time.perf_counter()
 
         begun = float(self.t)
+        position.is_broken_off = True  # until it has come to the end
         try:
             with progress_bar(self.wired.name, begun, begun + float(duration), progress) as show:
 
@@ -265,6 +269,7 @@ class Simulation:
         except KeyboardInterrupt as interrupt:
             self._elapsed += time.perf_counter() - started
             raise Interrupted(self.run(final=False)) from interrupt
+        position.is_broken_off = False
         self._elapsed += time.perf_counter() - started
 
     @accepts(
@@ -443,7 +448,7 @@ class Simulation:
         self._refuse_second_driver()
         recorder = self._recorder
         state = self.save() if final and self.can_save else None
-        if final and self._begun and not self._engine.is_ahead:
+        if final and self._begun and not (self._engine.is_ahead or self._engine.position.is_broken_off):
             recorder.last(self.t, self._engine.workspace.log)
         texts = self._engine.take_texts()
         if last:
@@ -496,7 +501,8 @@ class Simulation:
         FmuError
             If an FMU can't save its state, can't turn it into bytes, or has asked for the end of the run.
         OptionError
-            If the run has not begun, or has ended and its FMUs are freed, or has ended between two ticks.
+            If the run has not begun, or has ended and its FMUs are freed, or has ended between two ticks, or has failed
+            or was interrupted.
         """
         self._refuse_second_driver()
         if not self._begun or (self._engine.has_plants and not self._open):

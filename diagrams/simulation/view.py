@@ -26,6 +26,8 @@ class Position:
     """The stop condition, or the FMU, that has ended the run, which may be between two ticks."""
     end: float | None = None
     """Time in s between two ticks at which the run has ended, because its duration has."""
+    is_broken_off: bool = False
+    """Whether it has failed, or was interrupted, after this tick: the numbers may then be those of a later instant."""
     fired: list[Occurrence] = field(default_factory=list)
     """The events of the latest instant at which any fired."""
 
@@ -48,7 +50,7 @@ class Position:
 
     def restore(self, tick: int, stopped: Stopped | None) -> None:
         """Go to a saved position; nothing has fired there."""
-        self.tick, self.stopped, self.end = tick, stopped, None
+        self.tick, self.stopped, self.end, self.is_broken_off = tick, stopped, None, False
         self.fired.clear()
 
 

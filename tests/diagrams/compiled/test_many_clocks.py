@@ -1,5 +1,9 @@
 """Many clocks in C's loop: sets of them that act together, however many there are and however late they come."""
 
+import os
+import signal
+from threading import Timer
+
 import numpy as np
 import pytest
 
@@ -120,3 +124,25 @@ def test_what_was_recorded_before_an_error_at_such_a_set_is_kept(monkeypatch, co
     assert run.t[-1] == pytest.approx(0.209, abs=1e-9)
     for period in (2, 3, 5, 7):
         assert np.array_equal(run[f"every{period}.n.y"], expected(period, 209))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends itself a signal")
+@pytest.mark.parametrize("continuous", [False, True])
+def test_an_interrupt_while_c_runs_is_no_end_of_a_rare_tick(monkeypatch, continuous):
+    """Python would raise it as C calls for the rare tick, where ctypes drops it, and C would take the tick for done."""
+    monkeypatch.setattr(clock_sets, "_MOST_SETS", 1)
+    clock_sets._sets_of.cache_clear()
+    one = Constant(value=1.0, name="one")
+    others = [Integrator(name="time")(one)] if continuous else []
+    made = Diagram("clocks", *(counter(period, one) for period in (1, 1021)), *others)  # together once in 1021 ticks
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    timer = Timer(0.1, os.kill, (os.getpid(), signal.SIGINT))
+    try:
+        with made.simulation(step=1e-3) as simulation, pytest.raises(KeyboardInterrupt):
+            simulation.advance(50.0)
+            timer.start()
+            simulation.advance(1e4)
+    finally:
+        timer.cancel()
+        signal.signal(signal.SIGINT, before)
+        clock_sets._sets_of.cache_clear()

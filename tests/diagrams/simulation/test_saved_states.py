@@ -146,6 +146,40 @@ def test_a_simulation_goes_back_and_repeats_itself():
     assert np.array_equal(second.data, first.data[first.t >= 1.0])
 
 
+@pytest.mark.parametrize("continuous", [False, True])
+def test_a_run_that_was_interrupted_goes_back_to_a_state_and_not_on_from_where_it_was(continuous):
+    """C goes over thousands of ticks at a time: after an interrupt within them the numbers are those of a later one."""
+
+    @subsystem(sample_time=1e-3, name="box")
+    def box(u):
+        memory = UnitDelay(initial_value=0.0, name="n")
+        return memory(memory.y + u)
+
+    def interrupt(t):
+        if t > 0.2:
+            raise KeyboardInterrupt
+
+    one = Constant(value=1.0, name="one")
+    more = [Integrator(name="time")(one)] if continuous else []
+    with Diagram("d", box(one).named("y"), *more).simulation() as simulation:
+        simulation.advance(0.1)
+        state = simulation.save()
+        with pytest.raises(KeyboardInterrupt) as caught:
+            simulation.advance(10.0, progress=interrupt)
+        assert caught.value.run.t[-1] > 0.2
+        assert not simulation.can_save
+        with pytest.raises(OptionError, match=r"^d: the run has failed, or was interrupted, .* can't continue"):
+            simulation.advance(0.1)
+        with pytest.raises(OptionError, match=r"can't be saved there.*simulation\.restore\(state\)"):
+            simulation.save()
+        simulation.restore(state)
+        simulation.advance(0.1)
+        run = simulation.run()
+    assert run["y"].tolist() == [*range(100, 201)]
+    if continuous:
+        assert run["time.y"] == pytest.approx(run.t, abs=1e-12)
+
+
 @pytest.mark.slow
 def test_a_saved_state_is_not_changed_by_what_happens_later():
     with thermostat().simulation() as simulation:
