@@ -57,8 +57,9 @@ def save_state(engine: Engine) -> RunState:
 def broken_off_error(t: float, name: str, what: str) -> OptionError:
     """Return the error of a run that has failed or was interrupted after a tick, so that it can't do something."""
     return OptionError(
-        f"the run has failed, or was interrupted, on its way from t = {t:g} s, and can't {what}: its numbers may be those "
-        "of a later instant. Keep simulation.save() before such a part, and go back to it: simulation.restore(state).",
+        f"the run has failed, or was interrupted, on its way from t = {t:g} s, and can't {what}: its numbers may be "
+        "those of a later instant. Keep simulation.save() before such a part, and go back to it: "
+        "simulation.restore(state).",
         block=name,
     )
 
