@@ -16,6 +16,7 @@ from .diagrams.contract import BlockReport
 from .diagrams.coupling import CouplingReport
 from .diagrams.drawing import Drawing
 from .diagrams.flat import FlatDiagram, Layout
+from .diagrams.frequency import LinearDelays
 from .diagrams.linearization import (
     ApproximateDelay,
     CoarseValues,
@@ -23,7 +24,6 @@ from .diagrams.linearization import (
     FreeMotions,
     InexactDerivatives,
     Kink,
-    LinearDelays,
     Linearization,
     MeanSlope,
     RefutedDerivatives,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .delay_matrices import NEUTRAL, DelayMatrices, find_pade_limit, replace_delays
+from .delay_matrices import NEUTRAL, DelayMatrices
 from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .drawn_loops import DrawnLoop, phase_of
 from .frequency_data import read_frequency_data
+from .linear_delays import LinearDelays, find_pade_limit
 from .loop_drawing import draw_bode_axes, draw_nyquist_axes
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins, scan_margins
 from .loop_model import find_hidden_unstable
@@ -70,6 +71,7 @@ __all__ = [
     "GainCrossover",
     "GangOfFour",
     "Interval",
+    "LinearDelays",
     "MarginSlope",
     "Margins",
     "MeasuredMargins",
@@ -116,7 +118,6 @@ __all__ = [
     "realize",
     "refine_sign_change",
     "relative_difference",
-    "replace_delays",
     "sampled_gains",
     "sampled_poles",
     "scan_margins",

@@ -1,9 +1,8 @@
-"""Linear systems with delays: matrices of the rest, with the delays closed around it; its response and its roots.
+"""Poles of linear systems with delays (`LinearDelays`): roots of a characteristic function, and their number.
 
-ẋ = A x + B u + G w, z = C₂ x + D₂ u + H w, y = C x + D u + D₁ w with wᵢ(t) = zᵢ(t − τᵢ), a linear fractional form. At a
-point s it is a system of linear equations with E = diag(e^(−s τᵢ)). Its characteristic function is
+With E = diag(e^(−s τᵢ)) it is
 
-    f(s) = det(s I − A − G E (I − H E)⁻¹ C₂),
+    f(s) = det(s I − A − G E (I − H E)⁻¹ Z),
 
 of which every root beyond the limit of stability is counted by the argument along the axis (Mikhailov's criterion; Gu,
 Kharitonov and Chen, Stability of Time-Delay Systems, 2003). Padé's approximation is no part of that: its poles only say
@@ -25,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...blocks.core import ConfirmationError
-from ...blocks.library import PadeDelay
+from .linear_delays import LinearDelays
 from .structured_value import mu_bound, mu_scaling
 
 MARGINAL = 1e-11
@@ -44,8 +43,6 @@ NEUTRAL = 1.0 - 1e-12
 """Gain of the ways around the delays without a state from which on infinitely many roots are not stable."""
 LEFT = 0.1
 """Distance of such a gain from 1 that takes its place in the size within which roots are then searched."""
-RIGHT = 0.01
-"""Error of Padé's approximation, in parts of its input, up to which it is called right."""
 MOST_ROOTS = 1000
 """Roots beyond the limit up to which all are looked for."""
 CHAIN = 4.0
@@ -65,20 +62,27 @@ class DecoupledPart(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DelayMatrices:
-    """A system with delays and without inputs: the matrices A, G, C₂ and H, and the delays in s."""
+    """The matrices of a system with delays of which its poles depend, and the delays in s; see `LinearDelays`."""
 
     A: np.ndarray
     G: np.ndarray
-    C: np.ndarray
+    Z: np.ndarray
     H: np.ndarray
     tau: np.ndarray
+
+    @classmethod
+    def of(cls, A: np.ndarray, late: LinearDelays | None) -> DelayMatrices:
+        """Return those of the system with this A and these delays; None are no delays."""
+        if late is None:
+            return cls(A, np.zeros((len(A), 0)), np.zeros((0, len(A))), np.zeros((0, 0)), np.zeros(0))
+        return cls(A, late.G, late.Z, late.H, late.times)
 
     @cached_property
     def parts(self) -> list[DecoupledPart]:
         """The strongly connected parts; the characteristic function is the product of theirs."""
         from scipy.sparse.csgraph import connected_components
 
-        n, whole = len(self.A), np.block([[self.A, self.G], [self.C, self.H]])
+        n, whole = len(self.A), np.block([[self.A, self.G], [self.Z, self.H]])
         count, labels = connected_components(whole != 0.0, directed=True, connection="strong")
         found = []
         for k in range(count):
@@ -90,7 +94,7 @@ class DelayMatrices:
         """Return the matrices of a part alone."""
         x, w = part
         return DelayMatrices(
-            self.A[np.ix_(x, x)], self.G[np.ix_(x, w)], self.C[np.ix_(w, x)], self.H[np.ix_(w, w)], self.tau[w]
+            self.A[np.ix_(x, x)], self.G[np.ix_(x, w)], self.Z[np.ix_(w, x)], self.H[np.ix_(w, w)], self.tau[w]
         )
 
     @cached_property
@@ -135,21 +139,21 @@ class DelayMatrices:
 
     @cached_property
     def bound(self) -> float:
-        """Bound of |s| of all roots beyond the limit: the spectral radius of |A| + |G| (I − |H|)⁻¹ |C|.
+        """Bound of |s| of all roots beyond the limit: the spectral radius of |A| + |G| (I − |H|)⁻¹ |Z|.
 
         Where ways without a state have a gain of 1 or more there is none; then it is the size within which roots are
         searched.
         """
         if not len(self.A):
             return 0.0
-        A, G, C, H = (np.abs(M) for M in (self.A, self.G, self.C, self.H))
+        A, G, Z, H = (np.abs(M) for M in (self.A, self.G, self.Z, self.H))
         if not len(self.tau):
             return float(np.max(np.abs(np.linalg.eigvals(A))))
         if np.max(np.abs(np.linalg.eigvals(H)), initial=0.0) < 1.0:
-            return float(np.max(np.abs(np.linalg.eigvals(A + G @ np.linalg.solve(np.eye(len(H)) - H, C)))))
+            return float(np.max(np.abs(np.linalg.eigvals(A + G @ np.linalg.solve(np.eye(len(H)) - H, Z)))))
         mu, d = mu_scaling(self.H.astype(complex))
         left = 1.0 - mu if mu < NEUTRAL else LEFT
-        return float(np.linalg.norm(A, 2) + np.linalg.norm(G / d, 2) * np.linalg.norm(d[:, None] * C, 2) / left)
+        return float(np.linalg.norm(A, 2) + np.linalg.norm(G / d, 2) * np.linalg.norm(d[:, None] * Z, 2) / left)
 
     def poles(self) -> tuple[complex, ...]:
         """Return the poles without those far to the left, the rightmost first; all that are not stable are among them.
@@ -190,12 +194,12 @@ class DelayMatrices:
         tau = float(np.max(self.tau))
         omega = np.pi / (2.0 * tau) * np.arange(1, round(CHAIN * count) + 1)
         rest = np.linalg.inv(1j * omega[:, None, None] * np.eye(len(self.A)) - self.A)
-        gain = np.max(np.abs(np.linalg.eigvals(self.H + self.C @ rest @ self.G)), axis=1)
+        gain = np.max(np.abs(np.linalg.eigvals(self.H + self.Z @ rest @ self.G)), axis=1)
         chain = np.log(np.maximum(gain, 1e-300)) / tau + 1j * omega
         return self._search(np.concatenate([self.starts, chain, chain.conj()]))
 
     def evaluate(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return s I − A − G E (I − H E)⁻¹ C at points, and its derivative by s."""
+        """Return s I − A − G E (I − H E)⁻¹ Z at points, and its derivative by s."""
         n, m = len(self.A), len(self.tau)
         s = np.asarray(s, dtype=complex)
         eye = np.eye(n)
@@ -204,10 +208,10 @@ class DelayMatrices:
         E = np.exp(-s[:, None] * self.tau)
         X = np.linalg.inv(np.eye(m) - self.H * E[:, None, :])
         GE = self.G * E[:, None, :]
-        XC = X @ self.C
-        value = s[:, None, None] * eye - self.A - GE @ XC
+        XZ = X @ self.Z
+        value = s[:, None, None] * eye - self.A - GE @ XZ
         # d(E X)/ds = (I + E X H) (−τ E) X
-        inner = self.tau[:, None] * E[:, :, None] * XC
+        inner = self.tau[:, None] * E[:, :, None] * XZ
         slope = eye + (self.G + GE @ X @ self.H) @ inner
         return value, slope
 
@@ -221,11 +225,11 @@ class DelayMatrices:
         if not len(self.A):
             return np.zeros(0, dtype=complex)
         orders = [int(np.clip(np.ceil(self.bound * tau) + 6, 8, 24)) for tau in self.tau]
-        none = np.zeros((len(self.A), 0)), np.zeros((0, len(self.A))), np.zeros((0, 0))
-        empty = np.zeros((0, len(self.tau))), np.zeros((len(self.tau), 0))
+        n, m = len(self.A), len(self.tau)
+        without_ports = self.A, np.zeros((n, 0)), np.zeros((0, n)), np.zeros((0, 0))
+        late = LinearDelays((), self.tau, self.G, self.Z, self.H, E=np.zeros((0, m)), F=np.zeros((m, 0)))
         try:
-            rest = self.A, *none, self.G, self.C, self.H, *empty
-            return np.linalg.eigvals(replace_delays(*rest, self.tau, orders)[0])
+            return np.linalg.eigvals(late.approximate(without_ports, orders)[0])
         except np.linalg.LinAlgError:
             return np.zeros(0, dtype=complex)
 
@@ -316,7 +320,7 @@ class DelayMatrices:
         """Return the number of roots beyond the axis, by the argument of f along it."""
         n, is_real = (
             len(self.A),
-            all(np.isrealobj(M) or not np.any(np.imag(M)) for M in (self.A, self.G, self.C, self.H)),
+            all(np.isrealobj(M) or not np.any(np.imag(M)) for M in (self.A, self.G, self.Z, self.H)),
         )
         upper = self._turn()
         lower = upper if is_real else replace_conjugate(self)._turn()
@@ -389,56 +393,9 @@ def _find_chain(H: np.ndarray, tau: np.ndarray) -> float:
     return float(brentq(above, *ends, xtol=1e-13 * max(map(abs, ends)), rtol=1e-13))
 
 
-def replace_delays(
-    A: np.ndarray,
-    B: np.ndarray,
-    C: np.ndarray,
-    D: np.ndarray,
-    G: np.ndarray,
-    Z: np.ndarray,
-    H: np.ndarray,
-    E: np.ndarray,
-    F: np.ndarray,
-    tau: np.ndarray,
-    orders: Sequence[int],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return A, B, C and D with Padé's approximations of the delays, of some orders, behind the states.
-
-    The system is ẋ = A x + B u + G w, z = Z x + F u + H w, y = C x + D u + E w. Numbers may be complex, with slopes.
-
-    Raises `LinAlgError` if a way around the delays without a state has no unique solution.
-    """
-    m, q = len(tau), sum(orders)
-    kind = np.result_type(A, G, tau)
-    Ap, Bp, Cp, Dp = (np.zeros(shape, dtype=kind) for shape in ((q, q), (q, m), (m, q), (m, m)))
-    begin = 0
-    for i, (time, order) in enumerate(zip(tau, orders, strict=True)):
-        matrix, column = PadeDelay(delay=1.0, order=order).ladder()
-        where, sign = slice(begin, begin + order), (-1.0) ** order
-        Ap[where, where], Bp[where, i] = matrix * 2.0 / time, column * 2.0 / time
-        Cp[i, begin], Dp[i, i] = -sign * column[0], sign
-        begin += order
-    # w = Cp p + Dp z, z = Z x + F u + H w
-    loop = np.eye(m) - Dp @ H
-    wx, wu, wp = (np.linalg.solve(loop, part) for part in (Dp @ Z, Dp @ F, Cp))
-    whole = np.block([[A + G @ wx, G @ wp], [Bp @ (Z + H @ wx), Ap + Bp @ H @ wp]])
-    return whole, np.vstack([B + G @ wu, Bp @ (F + H @ wu)]), np.hstack([C + E @ wx, E @ wp]), D + E @ wu
-
-
-def find_pade_limit(order: int) -> float:
-    """Return the ω τ up to which Padé's approximation of a delay, an all-pass, is right to 1 % of its input."""
-    one, none = np.ones((1, 1)), np.zeros((0, 0))
-    row, column, empty = np.zeros((1, 0)), np.zeros((0, 1)), np.zeros((1, 1))
-    rest = none, column, row, empty, column, row, empty, one, one
-    A, B, C, D = replace_delays(*rest, np.ones(1), [order])
-    x = np.geomspace(0.01, 4.0 * order + 4.0, 4000)
-    made = np.array([(C @ np.linalg.solve(1j * w * np.eye(order) - A, B) + D)[0, 0] for w in x])
-    return float(x[int(np.argmax(np.abs(made - np.exp(-1j * x)) > RIGHT))])
-
-
 def replace_conjugate(system: DelayMatrices) -> DelayMatrices:
     """Return the system with conjugate matrices, whose roots are the conjugate ones."""
-    return replace(system, **{name: np.conj(getattr(system, name)) for name in "AGCH"})
+    return replace(system, **{name: np.conj(getattr(system, name)) for name in "AGZH"})
 
 
 def sort_rightmost(roots: Sequence[complex]) -> tuple[complex, ...]:

@@ -1,20 +1,21 @@
 """Responses of linear systems with delays over time, by the method of steps with spectral elements.
 
-On an element of time the states are a polynomial through Chebyshev-Lobatto points that fulfils ẋ = A x + B u + G w at
-all of them but the first (collocation, which is stiffly stable); w comes from past elements. Elements end where a delay
-lets out a jump, or a kink that such a jump has made, up to its eighth derivative: within an element all is smooth. An
-element is halved until the last Chebyshev coefficients are small.
+On an element of time the states are a polynomial through Chebyshev-Lobatto points that fulfils the equations of
+`LinearDelays` at all of them but the first (collocation, which is stiffly stable); w comes from past elements. Elements
+end where a delay lets out a jump, or a kink that such a jump has made, up to its eighth derivative: within an element
+all is smooth. An element is halved until the last Chebyshev coefficients are small.
 """
 
 from __future__ import annotations
 
 import bisect
 import itertools
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from ...blocks.core import ConfirmationError
+from .linear_delays import LinearDelays
+from .state_space import FourMatrices
 
 NODES = 13
 """Points of an element."""
@@ -26,47 +27,44 @@ MOST_ELEMENTS = 200_000
 """Elements after which a response is given up."""
 
 
-@dataclass(eq=False)
-class DelayedEquations:
-    """ẋ = A x + B u + G w, z = Z x + F u + H w, y = C x + D u + E w, wᵢ(t) = zᵢ(t − τᵢ), with the inputs u constant."""
+def respond(matrices: FourMatrices, late: LinearDelays, u: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return the outputs of a system with delays at rising times from 0 on, from rest, with constant inputs."""
+    return _Steps(*matrices, late).respond(u, times)
 
-    A: np.ndarray
-    B: np.ndarray
-    G: np.ndarray
-    Z: np.ndarray
-    F: np.ndarray
-    H: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
-    E: np.ndarray
-    tau: np.ndarray
-    _solvers: dict[float, np.ndarray] = field(default_factory=dict)
+
+class _Steps:
+    """The method of steps for a system with delays and constant inputs."""
+
+    def __init__(self, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, late: LinearDelays):
+        self.A, self.B, self.C, self.D, self.late = A, B, C, D, late
+        self._solvers: dict[float, np.ndarray] = {}
 
     def respond(self, u: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return the outputs at rising times from 0 on, from rest, with constant inputs from t = 0 on."""
+        """Return the outputs at rising times."""
+        late, tau = self.late, self.late.times
         end = float(times[-1])
         edges = self._edges(end)
-        longest = min([float(self.tau.min(initial=np.inf)), end, *([0.5 / self._fastest()] if len(self.A) else [])])
+        longest = min([float(tau.min(initial=np.inf)), end, *([0.5 / self._fastest()] if len(self.A) else [])])
         grid, points = _chebyshev(NODES)
         begins, zs, ys, lengths = list[float](), list[np.ndarray](), list[np.ndarray](), list[float]()
         t, x, h, size = 0.0, np.zeros(len(self.A)), longest * 2.0**-6, 1e-300
         while t < end * (1 - 1e-15):
             k = bisect.bisect_right(edges, t * (1 + 1e-14) + 1e-300)
             room = (edges[k] if k < len(edges) else end) - t
-            step = min(h, float(self.tau.min(initial=np.inf)))
+            step = min(h, float(tau.min(initial=np.inf)))
             step = room if step > 0.7 * room else step
-            w = self._late(t, step, grid, begins, lengths, zs, points)
-            X = self._collocate(x, self.B @ u + w @ self.G.T, step)
+            w = self._outputs_of_delays(t, step, grid, begins, lengths, zs, points)
+            X = self._collocate(x, self.B @ u + w @ late.G.T, step)
             size = max(size, float(np.max(np.abs(X), initial=0.0)), float(np.max(np.abs(w), initial=0.0)))
             bent = float(np.max(np.abs(_last_coefficients(np.hstack([X, w]))), initial=0.0))
             if bent > SMALL * size and step > 1e-9 * longest:
                 h = 0.5 * step
                 continue
-            z = X @ self.Z.T + self.F @ u + w @ self.H.T
+            z = X @ late.Z.T + late.F @ u + w @ late.H.T
             begins.append(t)
             lengths.append(step)
             zs.append(z)
-            ys.append(X @ self.C.T + self.D @ u + w @ self.E.T)
+            ys.append(X @ self.C.T + self.D @ u + w @ late.E.T)
             x, t = X[-1], t + step if step < room else (edges[k] if k < len(edges) else end)
             h = min(2.0 * step, 16.0 * longest) if bent < 1e-2 * SMALL * size else step
             if len(begins) > MOST_ELEMENTS:
@@ -83,9 +81,9 @@ class DelayedEquations:
     def _edges(self, end: float) -> list[float]:
         """Return the times at which a jump or one of its kinks comes out of delays."""
         found = {0.0}
-        front = {0.0}
-        for _ in range(ORDERS if not self.H.any() else 10 * ORDERS):
-            front = {round(t + tau, 14) for t, tau in itertools.product(front, self.tau) if t + tau < end} - found
+        front, late = {0.0}, self.late
+        for _ in range(ORDERS if not late.H.any() else 10 * ORDERS):
+            front = {round(t + tau, 14) for t, tau in itertools.product(front, late.times) if t + tau < end} - found
             if not front or len(found) > 20_000:
                 break
             found |= front
@@ -104,7 +102,7 @@ class DelayedEquations:
         right = forced[1:] - np.outer(_differentiate(NODES)[1:, 0] / h, x)
         return np.vstack([x, (self._solvers[h] @ right.ravel()).reshape(NODES - 1, n)])
 
-    def _late(
+    def _outputs_of_delays(
         self,
         t: float,
         h: float,
@@ -115,8 +113,8 @@ class DelayedEquations:
         weights: np.ndarray,
     ) -> np.ndarray:
         """Return the outputs of the delays at the points of an element, shape (points, delays)."""
-        w = np.zeros((NODES, len(self.tau)))
-        for i, tau in enumerate(self.tau):
+        w = np.zeros((NODES, len(self.late.times)))
+        for i, tau in enumerate(self.late.times):
             middle = t + 0.5 * h - tau
             if middle <= 0.0:
                 continue

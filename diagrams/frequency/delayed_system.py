@@ -11,8 +11,10 @@ from control.iosys import InputOutputSystem
 from numpy.typing import ArrayLike
 
 from ...blocks.core import Finding, OptionError, brief, count_of, explain_calls
-from .delay_matrices import DelayMatrices, replace_delays
-from .delayed_response import DelayedEquations
+from .delay_matrices import DelayMatrices
+from .delayed_response import respond
+from .linear_delays import LinearDelays
+from .state_space import FourMatrices
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData
@@ -131,18 +133,16 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
 
     def _values(self, s: np.ndarray) -> np.ndarray:
         """Return the transfer matrix at points, shape (points, outputs, inputs); infinite at a pole."""
-        e, n, m = self.equations(), self.rest.nstates, len(self.delays)
-        into = np.vstack([e.B, e.F]).astype(complex)
+        (A, B, C, D), late = self.equations()
+        n, into = len(A), np.vstack([B, late.F]).astype(complex)
         found = np.empty((len(s), self.noutputs, self.ninputs), dtype=complex)
         for i, at in enumerate(s):
-            late = np.exp(-at * self.delays)
-            M = np.block([[at * np.eye(n) - e.A, -e.G * late], [-e.Z, np.eye(m) - e.H * late]])
             try:
-                v = np.linalg.solve(M, into)
+                v = np.linalg.solve(late.matrix_at(A, at), into)
             except np.linalg.LinAlgError:
                 found[i] = np.inf
                 continue
-            found[i] = e.D + e.C @ v[:n] + (e.E * late) @ v[n:]
+            found[i] = D + C @ v[:n] + (late.E * np.exp(-at * late.times)) @ v[n:]
         return found
 
     def dcgain(self) -> Any:
@@ -156,8 +156,8 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
 
     def characteristic(self) -> DelayMatrices:
         """Return the matrices of the characteristic function."""
-        e = self.equations()
-        return DelayMatrices(e.A, e.G, e.Z, e.H, self.delays)
+        (A, _, _, _), late = self.equations()
+        return DelayMatrices.of(A, late)
 
     def poles(self) -> np.ndarray:
         """Return the poles, the rightmost first.
@@ -197,23 +197,22 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
         OptionError
             If delays stand in ways without a state that are singular without them.
         """
-        e, m = self.equations(), len(self.delays)
-        loop = np.eye(m) - e.H
-        if m and np.linalg.cond(loop) > 1e12:
+        (A, B, C, D), late = self.equations()
+        if len(self.delays) and np.linalg.cond(np.eye(len(self.delays)) - late.H) > 1e12:
             raise OptionError(
                 "found delays in a way without a state that has no unique solution without them; expected one.",
                 block=self.name,
             )
-        zx, zu = np.linalg.solve(loop, e.Z), np.linalg.solve(loop, e.F)
-        return ss(e.A + e.G @ zx, e.B + e.G @ zu, e.C + e.E @ zx, e.D + e.E @ zu, 0)
+        wx, wu = late.settle(late.Z), late.settle(late.F)
+        return ss(A + late.G @ wx, B + late.G @ wu, C + late.E @ wx, D + late.E @ wu, 0)
 
     def pade(self, order: int = 5) -> StateSpace:
         """Return the rational model with each delay replaced by Padé's approximation of an order.
 
         Its phase is that of the delay up to about ω τ = order; `PadeDelay` has the realization.
         """
-        e = self.equations()
-        four = replace_delays(e.A, e.B, e.C, e.D, e.G, e.Z, e.H, e.E, e.F, self.delays, [order] * len(self.delays))
+        matrices, late = self.equations()
+        four = late.approximate(matrices, [order] * len(self.delays))
         labels = {"inputs": self.input_labels, "outputs": self.output_labels}
         made = ss(*four, 0, remove_useless_states=False, name=self.name, **labels)
         made.findings, made.notes, made.inexactness = self.findings, self.notes, self.inexactness
@@ -234,14 +233,12 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
         ConfirmationError
             If the response needs too many elements.
         """
-        return self.equations().respond(np.eye(self.ninputs)[entry], np.atleast_1d(np.asarray(times, dtype=float)))
+        return respond(*self.equations(), np.eye(self.ninputs)[entry], np.atleast_1d(np.asarray(times, dtype=float)))
 
-    def equations(self) -> DelayedEquations:
-        """Return the system's equations over time."""
-        p, q = self.noutputs, self.ninputs
+    def equations(self) -> tuple[FourMatrices, LinearDelays]:
+        """Return A, B, C and D without the delays, and the delays that are closed around them."""
         A, B, C, D = (np.asarray(getattr(self.rest, k), dtype=float) for k in "ABCD")
-        parts = A, B[:, :q], B[:, q:], C[p:], D[p:, :q], D[p:, q:], C[:p], D[:p, :q], D[:p, q:]
-        return DelayedEquations(*parts, self.delays)
+        return LinearDelays.split((A, B, C, D), self.delays, self.delay_names)
 
     # --- arithmetic ---------------------------------------------------------------------------------------------------
 
@@ -369,28 +366,21 @@ def _join(a: DelayedSystem, b: DelayedSystem, back: np.ndarray, into: np.ndarray
     """Return two systems side by side, with u = back y + into r, and out y as outputs."""
     from scipy.linalg import block_diag
 
-    first, second = a.equations(), b.equations()
-    A, B, G, C, Z, D, Dw, Dz, H = (block_diag(getattr(first, k), getattr(second, k)) for k in "ABGCZDEFH")
-    loop = np.eye(len(D)) - D @ back
-    if np.linalg.cond(loop) > 1e12:
+    (first, one), (second, two) = a.equations(), b.equations()
+    A, B, C, D = (block_diag(*pair) for pair in zip(first, second, strict=True))
+    G, Z, H, E, F = (block_diag(getattr(one, k), getattr(two, k)) for k in "GZHEF")
+    if np.linalg.cond(np.eye(len(D)) - D @ back) > 1e12:
         raise OptionError(
             "found a loop without a state and without a unique solution; expected one. Look at D of both systems.",
             block=a.name,
         )
-    # y = (I − D back)⁻¹ (C x + Dw w + D into r)
-    yx, yw, yr = np.linalg.solve(loop, C), np.linalg.solve(loop, Dw), np.linalg.solve(loop, D @ into)
-    ux, uw, ur = back @ yx, back @ yw, into + back @ yr
-    rest = ss(
-        A + B @ ux,
-        np.hstack([B @ ur, G + B @ uw]),
-        np.vstack([out @ yx, Z + Dz @ ux]),
-        np.vstack([np.hstack([out @ yr, out @ yw]), np.hstack([Dz @ ur, H + Dz @ uw])]),
-        0,
-    )
+    both = LinearDelays((), np.concatenate([a.delays, b.delays]), G, Z, H, E, F)
+    closed, late = both.feed_back((A, B, C, D), back, into, out)
+    rest = ss(*late.join(closed), 0)
     names = [*a.delay_names, *b.delay_names]
     if len(set(names)) < len(names):
         names = []
-    made = DelayedSystem(rest, np.concatenate([a.delays, b.delays]), names)
+    made = DelayedSystem(rest, both.times, names)
     made.findings = tuple(dict.fromkeys((*a.findings, *b.findings)))
     made.notes = tuple(dict.fromkeys((*a.notes, *b.notes)))
     made.inexactness = max(a.inexactness, b.inexactness)

@@ -16,7 +16,6 @@ and in `model_at`, which makes the linear models:
 
 from .block_slopes import linearize_block
 from .derivatives import moves_between_ticks
-from .flow_model import LinearDelays
 from .free_motions import FreeMotion, FreeMotions
 from .inserted_blocks import carry_point, cut_to, find_inputs, name_of_cut, name_wire_to, with_passed_values
 from .kinks import find_kinks_between
@@ -77,7 +76,6 @@ __all__ = [
     "InertConsumer",
     "InexactDerivatives",
     "Kink",
-    "LinearDelays",
     "Linearization",
     "LoopSlope",
     "MeanSlope",

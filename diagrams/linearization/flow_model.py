@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ...blocks.core import Finding, OptionError, explain_calls, left_of
+from ...blocks.core import Finding, OptionError, left_of
 from ...fmus.fmu_block import Derivation
 from ..flat import NONE, FlatDiagram, announcers
-from ..frequency import FourMatrices, find_pade_limit, hold_inputs, replace_delays
+from ..frequency import FourMatrices, LinearDelays, find_pade_limit, hold_inputs
 from ..results import OperatingPoint
 from ..simulation import late_progress
 from .delay_channels import delay_channels
@@ -21,32 +21,6 @@ from .plant_models import EQUILIBRIUM, join_matrices, states_of
 
 STAGES = (1.0, 0.6, 0.2816, 0.857, 0.0526, 0.3333, 0.6513, 0.1184, 0.25, 0.3077, 0.0789)
 """Instants within a step at which DOP853 asks for rates, as parts of the step; the end comes first."""
-
-
-@explain_calls
-@dataclass(frozen=True, eq=False)
-class LinearDelays:
-    """The delays of a continuous linear model, closed around its matrices.
-
-    ẋ = A x + B d + G w, z = Z x + F d + H w, y = C x + D d + E w, with wᵢ(t) = zᵢ(t − τᵢ).
-
-    Attributes
-    ----------
-    names : tuple of str
-        Outputs of the `TransportDelay` blocks, entry by entry.
-    times : ndarray, shape (m,)
-        τ in s.
-    G, Z, H, E, F : ndarray
-        Matrices of shapes (states, m), (m, states), (m, m), (outputs, m) and (m, inputs).
-    """
-
-    names: tuple[str, ...]
-    times: np.ndarray
-    G: np.ndarray
-    Z: np.ndarray
-    H: np.ndarray
-    E: np.ndarray
-    F: np.ndarray
 
 
 @dataclass
@@ -192,9 +166,10 @@ def model_continuous(local: LocalDerivatives, at: OperatingPoint, plants: str | 
     if len(channels):
         mine = {k: v[channels.inputs] for k, v in z_of.items()}
         G, Z = np.vstack([fl, Bp @ z_of["l"]]), np.hstack([mine["x"], mine["p"]])
-        delays = LinearDelays(channels.labels, np.array([*map(float, channels.times)]), G, Z, mine["l"], yl, mine["d"])
+        times = np.array([*map(float, channels.times)])
+        delays = LinearDelays(channels.labels, times, G, Z, H=mine["l"], E=yl, F=mine["d"])
         off = J["z"][channels.inputs] - at.w[channels.outputs]  # still on their way
-        rates = rates + G @ np.linalg.lstsq(np.eye(len(channels)) - mine["l"], off, rcond=None)[0]
+        rates = rates + G @ delays.settle(off)
     return Model(
         (A, B, np.hstack([yx, yp]), yd),
         0.0,
@@ -211,11 +186,9 @@ def approximate_delays(model: Model, order: int) -> Model:
     late = model.delays
     if late is None:
         return model
-    n, m = len(model.matrices[0]), len(late.times)
     A, B, C, D = model.matrices
-    B, C = B.reshape(n, late.F.shape[1]), C.reshape(len(late.E), n)
-    D = D.reshape(len(late.E), late.F.shape[1])
-    four = replace_delays(A, B, C, D, late.G, late.Z, late.H, late.E, late.F, late.times, [order] * m)
+    n, q, p = len(A), late.F.shape[1], len(late.E)
+    four = late.approximate((A, B.reshape(n, q), C.reshape(p, n), D.reshape(p, q)), [order] * len(late.times))
     limit = find_pade_limit(order)
     findings = [
         ApproximateDelay(name.rpartition(".")[0], "y", "u", order, float(tau), limit / float(tau))

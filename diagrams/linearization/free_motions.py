@@ -113,9 +113,8 @@ def find_free_motions(model: ClosedModel, required: Iterable[str] = ()) -> FreeM
     if not right.shape[1]:
         return none
     if model.delays is not None:  # a Jordan chain may go through a delay
-        F = model.delays
-        through = np.linalg.lstsq(np.eye(len(F.H)) - F.H, F.Z[:, kept])[0]
-        left = find_null_spaces(M + F.G[kept] @ through, uncertainty)[1]
+        late = model.delays
+        left = find_null_spaces(M + late.G[kept] @ late.settle(late.Z[:, kept]), uncertainty)[1]
     noise = max(NOISE, 100.0 * uncertainty / (float(np.max(np.abs(A))) or 1.0))
     shifted = ShiftedDiagram.of(model, required, kept, noise)
     V = localize(right, M, rest)

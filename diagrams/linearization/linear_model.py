@@ -42,6 +42,7 @@ from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..frequency import (
     NEUTRAL,
     DelayMatrices,
+    LinearDelays,
     delayed_loop_class,
     delayed_system_class,
     finite_zeros,
@@ -56,7 +57,7 @@ from .cut_findings import find_cut_findings
 from .delay_channels import blocks_around
 from .derivatives import LocalDerivatives, find_moving
 from .exchanged import derivations_at, findings_on
-from .flow_model import LinearDelays, Model, approximate_delays, model_continuous, relative_error
+from .flow_model import Model, approximate_delays, model_continuous, relative_error
 from .free_motions import FreeMotions, find_free_motions
 from .inserted_blocks import name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
@@ -246,7 +247,11 @@ class Linearization(ShownAsTable):
         }
         name = name.replace(".", "_")
         if self.delays:
-            system = self._delayed_system(C, D, sign * self.delays.E, name, names, loop=kind is not None)
+            late = replace(self.delays, E=sign * self.delays.E)
+            rest = StateSpace(*late.join((self.A, self.B, C, D)), 0, remove_useless_states=False)
+            ports = {"inputs": names["inputs"], "outputs": names["outputs"]}
+            make = delayed_system_class() if kind is None else delayed_loop_class()
+            system: Any = make(rest, late.times, late.names, name=name, **ports)
         else:
             system = (kind or StateSpace)(
                 self.A, self.B, C, D, self.dt, name=name, remove_useless_states=False, **names
@@ -256,25 +261,6 @@ class Linearization(ShownAsTable):
         taken = (finding for finding in self.findings if isinstance(finding, EntryTaken))
         system.notes = tuple(map(str, dict.fromkeys((*self.carried, *taken))))
         return system
-
-    def _delayed_system(
-        self, C: np.ndarray, D: np.ndarray, E: np.ndarray, name: str, names: dict[str, Any], *, loop: bool
-    ) -> Any:
-        """Return the model as a system with delays; C, D and E are the matrices of its outputs."""
-        from control import StateSpace
-
-        delays = self.delays
-        assert delays is not None  # callers look
-        rest = StateSpace(
-            self.A,
-            np.hstack([self.B, delays.G]),
-            np.vstack([C, delays.Z]),
-            np.block([[D, E], [delays.F, delays.H]]),
-            0,
-            remove_useless_states=False,
-        )
-        kind = delayed_loop_class() if loop else delayed_system_class()
-        return kind(rest, delays.times, delays.names, name=name, inputs=names["inputs"], outputs=names["outputs"])
 
     def refuse_delays(self, what: str) -> None:
         """Refuse a use of the matrices alone, which ``what`` names.
@@ -295,10 +281,10 @@ class Linearization(ShownAsTable):
     def characteristic(self) -> DelayMatrices:
         """The characteristic function of a continuous model, whose roots are its poles; without memory."""
         keep = [i for i, name in enumerate(self.states) if name not in self.memory]
-        A, delays = self.A[np.ix_(keep, keep)], self.delays
-        if delays is None:
-            return DelayMatrices(A, np.zeros((len(A), 0)), np.zeros((0, len(A))), np.zeros((0, 0)), np.zeros(0))
-        return DelayMatrices(A, delays.G[keep], delays.Z[:, keep], delays.H, delays.times)
+        late = self.delays
+        if late is not None:
+            late = replace(late, G=late.G[keep], Z=late.Z[:, keep])
+        return DelayMatrices.of(self.A[np.ix_(keep, keep)], late)
 
     @property
     def neutral_blocks(self) -> tuple[str, ...]:
@@ -317,11 +303,11 @@ class Linearization(ShownAsTable):
 
     def characteristic_without(self, free: FreeMotions) -> DelayMatrices:
         """Return the characteristic function without the roots of some free motions, of a continuous model."""
-        delays = self.delays
-        if not free or delays is None:
+        late = self.delays
+        if not free or late is None:
             return self.characteristic
-        A, G, Z = free.reduce(self.A), free.reduce_inputs(delays.G), free.reduce_outputs(delays.Z)
-        return DelayMatrices(A, G, Z, delays.H, delays.times)
+        late = replace(late, G=free.reduce_inputs(late.G), Z=free.reduce_outputs(late.Z))
+        return DelayMatrices.of(free.reduce(self.A), late)
 
     @cached_property
     def findings_on_loops(self) -> tuple[Finding, ...]:

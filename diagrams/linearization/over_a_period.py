@@ -24,10 +24,10 @@ import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, PeriodicLoopError
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
-from ..frequency import FourMatrices
+from ..frequency import FourMatrices, LinearDelays
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives
-from .flow_model import LinearDelays, Model, model_continuous
+from .flow_model import Model, model_continuous
 from .left_out_effects import MemoryActs
 from .plant_models import EQUILIBRIUM
 from .taps import Tap, find_signal
@@ -303,9 +303,8 @@ def confirm_loop(
         if late is None or delays is None:
             both = [np.eye(len(a)) - a / z for a in (closed, A)]
         else:
-            into, through = np.linalg.solve(back, C), np.linalg.solve(back, late.E)
-            made = closed, late.G + B @ through, late.Z + late.F @ into, late.H + late.F @ through
-            both = [_with_delays(four, late.times, z) for four in (made, (A, delays.G, delays.Z, delays.H))]
+            (closed, _, _, _), around = late.feed_back(cut.matrices, np.eye(len(D)), D[:, :0], D[:0])
+            both = [_with_delays(a, own, z) for a, own in ((closed, around), (A, delays))]
         (s1, l1), (s2, l2) = map(np.linalg.slogdet, both)
         off = float(abs(s1 / s2 * np.exp(l1 - l2) - 1.0))
         worst = max(worst, math.inf if math.isnan(off) else off)
@@ -318,11 +317,11 @@ def confirm_loop(
         )
 
 
-def _with_delays(four: FourMatrices, tau: np.ndarray, s: complex) -> np.ndarray:
+def _with_delays(A: np.ndarray, late: LinearDelays, s: complex) -> np.ndarray:
     """Return the matrix whose determinant is the characteristic function at s, over s to the number of states."""
-    A, G, Z, H = four
-    w = np.exp(-s * tau)
-    return np.block([[np.eye(len(A)) - A / s, -G * w / s], [-Z, np.eye(len(H)) - H * w]])
+    found = late.matrix_at(A, s)
+    found[: len(A)] /= s
+    return found
 
 
 # --- each tick -------------------------------------------------------------------------------------------------------

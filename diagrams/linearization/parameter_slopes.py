@@ -16,7 +16,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, ParameterError
 from ..flat import NONE, FlatDiagram, WiredDiagram
-from ..frequency import FourMatrices, delayed_system_class, replace_delays
+from ..frequency import FourMatrices, LinearDelays, delayed_system_class
 from ..results import OperatingPoint, layout_of
 from ..wiring import join
 from .delay_channels import delay_channels
@@ -111,18 +111,19 @@ def loop_of_variant(
     at.check_fits(flat, diagram.name)
     made = _model_at(model, at, diagram.name, *_derivatives(model, flat, at, wires), slow)
     rests = bool(np.max(np.abs(made.affine), initial=0.0) <= EQUILIBRIUM)
-    A, B, C, D = _loop_matrices(made)
-    if (late := made.delays) is not None:
-        whole = np.hstack([B, late.G]), np.vstack([C, late.Z]), np.block([[D, -late.E], [late.F, late.H]])
-        rest = System(A, *whole, 0, remove_useless_states=False)
+    matrices, late = _loop_of(made)
+    if late is not None:
+        rest = System(*late.join(matrices), 0, remove_useless_states=False)
         return delayed_system_class()(rest, late.times, late.names), rests
-    return System(A, B, C, D, made.dt, remove_useless_states=False), rests
+    return System(*matrices, made.dt, remove_useless_states=False), rests
 
 
-def _loop_matrices(made: Model) -> FourMatrices:
+def _loop_of(made: Model) -> tuple[FourMatrices, LinearDelays | None]:
+    """Return the matrices of the loop L of a diagram that is cut, and its delays: the outputs' sign is the other."""
     A, B, C, D = made.matrices
     n, m = len(A), len(D)
-    return A, B.reshape(n, m), -C.reshape(m, n), -D
+    late = made.delays
+    return (A, B.reshape(n, m), -C.reshape(m, n), -D), None if late is None else replace(late, E=-late.E)
 
 
 def rational_loop(L: Any, order: int = 0) -> Any:
@@ -135,12 +136,8 @@ def rational_loop(L: Any, order: int = 0) -> Any:
 
 def _rational_matrices(made: Model, order: int) -> FourMatrices:
     """Return the matrices of `rational_loop`."""
-    A, B, C, D = _loop_matrices(made)
-    late = made.delays
-    if late is None:
-        return A, B, C, D
-    orders = [order or SLOPES_ORDER] * len(late.times)
-    return replace_delays(A, B, C, D, late.G, late.Z, late.H, -late.E, late.F, late.times, orders)
+    matrices, late = _loop_of(made)
+    return matrices if late is None else late.approximate(matrices, [order or SLOPES_ORDER] * len(late.times))
 
 
 def _derivatives(
@@ -218,8 +215,7 @@ class _Cut:
                 return start if np.max(np.abs(slope_of(made.affine)), initial=0.0) <= LOST else None
             A, late, w = np.real(made.matrices[0]), made.delays, np.zeros(at.w.size)
             if late is not None:  # at rest a delay puts out what it takes in
-                through = np.linalg.pinv(np.eye(len(late.times)) - np.real(late.H))
-                A = A + np.real(late.G) @ through @ np.real(late.Z)
+                A = A + np.real(late.G @ late.settle(late.Z))
             moved = _smallest(A, -slope_of(made.affine))
             if moved is None:
                 return None
@@ -228,7 +224,7 @@ class _Cut:
             if late is not None:
                 channels = delay_channels(flat)
                 z = slope_of(closed.differentiate(NONE, at.t, start.x, start.w)["z"])[channels.inputs]
-                w[channels.outputs] = through @ (np.real(late.Z) @ moved + z)
+                w[channels.outputs] = np.real(late.settle(late.Z @ moved + z))
                 return replace(at, x=join_slope(at.x, x), w=join_slope(at.w, w))
             return replace(at, x=join_slope(at.x, x))
         chain = Chain(closed, start, model.plants, period_of(flat))

@@ -15,13 +15,13 @@ from ...blocks.core import FmuError, Layout, LoopwrightError
 from ...fmus.fmu_block import take_shifted_steps
 from ...fmus.platform import is_built_here
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
+from ..frequency import LinearDelays
 from ..results import OperatingPoint
 from ..wiring import Wire, join
 from .absorbed_shifts import ShiftedBlock
 from .delay_channels import delay_channels
 from .derivatives import LocalDerivatives, Numbers
 from .exchanged import noise_of
-from .flow_model import LinearDelays
 from .over_a_period import find_needed, own_states
 from .plant_models import PlantModel, fmu_at, join_matrices, linearize_equations, plant_entries, plant_point
 from .signal_paths import SignalPaths

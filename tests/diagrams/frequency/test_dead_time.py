@@ -20,6 +20,7 @@ from loopwright.diagrams.frequency.delayed_system import DelayedSystem
 from loopwright.diagrams.frequency.loop_margins import scan_margins
 from loopwright.diagrams.frequency.loop_scan import LoopScan
 from loopwright.frequency import disk_margin, margins, nyquist_count
+from loopwright.types import LinearDelays
 
 
 def rational(numerator, denominator, name):
@@ -630,3 +631,19 @@ def test_a_gain_around_a_dead_time_has_the_margins_of_a_circle(gain):
         assert float(found.ms) == pytest.approx(1.0 / (1.0 - gain), rel=1e-6)
     else:
         assert np.isnan(float(found.gain_margin_high))
+
+
+def test_delays_are_split_from_their_rest_and_fed_back():
+    """u = −k y of ẋ = u, y = x(t − 1): s = W(−k) is a pole; without the delay at rest, y = x."""
+    k = 0.7
+    names, tau = ("late.y",), np.array([1.0])
+    rest = np.zeros((1, 1)), np.array([[1.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[0.0, 1.0], [0.0, 0.0]])
+    matrices, late = LinearDelays.split(rest, tau, names)
+    assert [M.tolist() for M in matrices] == [[[0.0]], [[1.0]], [[0.0]], [[0.0]]]
+    assert [M.tolist() for M in (late.G, late.Z, late.H, late.E, late.F)] == [[[0]], [[1]], [[0]], [[1]], [[0]]]
+    assert all(np.array_equal(a, b) for a, b in zip(late.join(matrices), rest, strict=True))
+    (A, *_), closed = late.feed_back(matrices, np.array([[-k]]), np.eye(1), np.eye(1))
+    root = complex(lambertw(-k))
+    assert abs(np.linalg.det(closed.matrix_at(A, root))) < 1e-14
+    assert abs(np.linalg.det(closed.matrix_at(A, root + 0.1))) > 0.01
+    assert (A + closed.G @ closed.settle(closed.Z)).tolist() == [[pytest.approx(-k, rel=1e-14)]]
