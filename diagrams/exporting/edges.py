@@ -38,7 +38,7 @@ def find_edges(opened: OpenDiagram, sources: Sequence[tuple[str, Announcer]]) ->
                 raise DefinitionError(
                     f"it has more than {_MOST} discontinuities, which don't repeat; so many are not exported. Put it "
                     "into a sampled subsystem, or leave it outside: outside=….",
-                    block=opened.shown(path),
+                    block=path,
                 )
             single.update(found)
     return tuple((t, late.get(t, t)) for t in sorted(single)), tuple(periodic)

@@ -18,19 +18,18 @@ def refuse(opened: OpenDiagram) -> None:
     for path, block in table.blocks.items():
         if path == opened.outside:
             continue
-        shown = opened.shown(path)
         if block.transport and not table.is_sampled(table.subsystem_of[path]):
             raise DefinitionError(
                 "it is a transport delay in continuous time, which keeps each step of the solver for the length of the "
                 "delay: its memory has no bound, also for a constant delay, and an exported diagram has a fixed one. "
                 "Put it into a sampled subsystem, @subsystem(sample_time=…), where it is a delay by whole samples.",
-                block=shown,
+                block=path,
             )
         if block.opaque and not isinstance(block, Fmu):
             raise DefinitionError(
                 "Python evaluates it, and nothing exported has Python inside. Write its equations with NumPy functions "
                 "that can be traced, or export the part of the diagram without it.",
-                block=shown,
+                block=path,
             )
 
 
@@ -38,9 +37,8 @@ def refuse_fmus(opened: OpenDiagram) -> None:
     """Refuse FMUs: a target has the plant in front of it."""
     for path, block in opened.wired.scheduled.blocks.items():
         if path != opened.outside and (block.in_model_exchange or (block.stepped and not block.transport)):
-            shown = opened.shown(path)
             raise DefinitionError(
-                "it is an FMU, and no target has one. Leave it outside: outside=[" + repr(shown) + "].", block=shown
+                f"it is an FMU, and no target has one. Leave it outside: outside=[{path!r}].", block=path
             )
 
 
@@ -61,7 +59,7 @@ def _refuse_states(opened: OpenDiagram) -> None:
             "it is in continuous time, and C in single precision has ticks alone. Take number='double', whose source "
             "has the loop of runs inside, put it into a sampled subsystem, @subsystem(sample_time=…), or leave it "
             f"outside: {_leave_out(opened)}.",
-            block=opened.shown(path),
+            block=path,
         )
 
 
@@ -69,8 +67,8 @@ def _leave_out(opened: OpenDiagram) -> str:
     """Return what to write, so that blocks in continuous time with states stay outside."""
     table = opened.wired.scheduled
     clocked = [path for path in table.subsystems if path and "." not in path and table.is_sampled(path)]
-    alone = f", or write a sampled subsystem alone: subsystem={opened.shown(clocked[0])!r}" if clocked else ""
-    return f"outside={[opened.shown(path) for path in find_continuous(opened)]}{alone}"
+    alone = f", or write a sampled subsystem alone: subsystem={clocked[0]!r}" if clocked else ""
+    return f"outside={find_continuous(opened)}{alone}"
 
 
 def refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:
@@ -81,14 +79,14 @@ def refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:
             f"its event {event.name!r} is between ticks, and C in single precision has ticks alone. Take "
             "number='double', whose source has the loop of runs inside, or put it into a sampled subsystem, "
             "sample_time=….",
-            block=opened.shown(event.path),
+            block=event.path,
         )
     for full in flat.loops.slices:
         path, port = flat.ports[full]
         raise DefinitionError(
             "an algebraic loop is solved by iterations, and C in single precision has none. Take number='double', "
             "whose source has the loop of runs inside, or put a UnitDelay() into the loop.",
-            block=opened.shown(path),
+            block=path,
             port=port,
         )
     if len(flat.distinct) > CLOCK_LIMIT:

@@ -152,9 +152,29 @@ def open_part(wired: WiredDiagram, path: str, name: str) -> OpenDiagram:
     if ports:
         part.blocks[_OUTSIDE] = Outside(tuple(ports.values()), name=_OUTSIDE)
         part.subsystem_of[_OUTSIDE] = ""
+    called = _outer_names(table, found)
+    part.names = {n: w for n, w in part.names.items() if n not in called.values()}
     opened = WiredDiagram(name, part, wired.loops, wired.facade_class)
-    outputs = {output: opened.scheduled.results[p, output] for p, output in part.results if p == found}
+    results = {output: opened.scheduled.results[p, output] for p, output in part.results if p == found}
+    outputs = {called[n].rpartition(".")[2] if n in called else n: wire for n, wire in results.items()}
     return OpenDiagram(opened, _OUTSIDE if ports else "", _apart(outputs, taken, found), found, start.states)
+
+
+def _outer_names(table: Structure, path: str) -> dict[str, str]:
+    """Return wires' full names outside of a subsystem for its outputs that have no name of their own inside."""
+    outputs = [output for p, output in table.results if p == path]
+    found: dict[str, str] = {}
+    taken = set(outputs)
+    for output in outputs:
+        if join(path, output) in table.names:
+            continue
+        for name, wire in table.names.items():
+            last = name.rpartition(".")[2]
+            if wire == table.results[path, output] and not name.startswith(f"{path}.") and last not in taken:
+                found[output] = name
+                taken.add(last)
+                break
+    return found
 
 
 def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDiagram:

@@ -32,7 +32,7 @@ def own_fmus(opened: OpenDiagram, way_out: str = _WAY_OUT) -> dict[str, Fmu]:
     for path, block in opened.wired.scheduled.blocks.items():
         if path == opened.outside or block.transport or not (block.stepped or block.in_model_exchange):
             continue
-        _check(block, opened.shown(path), way_out)
+        _check(block, path, way_out)
         assert isinstance(block, Fmu)
         found[path] = block
     return dict(sorted(found.items()))

@@ -144,7 +144,7 @@ def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSp
     refuse(opened)
     refuse_fmus(opened)
     if not opened.wired.has_clock:
-        continuous = [opened.shown(path) for path in find_continuous(opened)]
+        continuous = find_continuous(opened)
         raise DefinitionError(
             "found no sample time, at which a target calls tick. Give one: @subsystem(sample_time=1e-3) of the "
             "controller, or diagram.sampled(1e-3) of all.",

@@ -1,13 +1,14 @@
 """C for a target: the numbers of the run in every bit, on this machine and on a Cortex-M, without a warning."""
 
 import itertools
+import re
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
 
-from loopwright import Diagram, subsystem, to_c
+from loopwright import Diagram, build, subsystem, to_c
 from loopwright.blocks import (
     PID,
     BandLimitedNoise,
@@ -16,6 +17,7 @@ from loopwright.blocks import (
     DiscreteStateSpace,
     Gain,
     PulseTrain,
+    PythonFunction,
     Relay,
     Sine,
     Step,
@@ -278,6 +280,19 @@ def test_the_files_name_what_an_engineer_looks_for(tmp_path):
     assert code.ticks[0].inputs == ("reference", "level")
 
 
+def test_an_output_is_called_as_its_wire_inside_else_as_the_one_outside_else_as_its_port(tmp_path):
+    @subsystem(sample_time=0.1)
+    def controller(r):
+        effort = PID(kp=2.0, name="pid")(r, 1.0)
+        return effort, Gain(gain=2.0, name="twice")(effort).named("doubled"), Gain(gain=3.0, name="thrice")(effort)
+
+    voltage, outer, rest = controller(Step(times=0.1, values=1.0, name="r"))
+    loop = Diagram("loop", voltage.named("voltage"), outer.named("outside"), rest)
+    header = loop.to_c(tmp_path, subsystem="controller").files[0].read_text(encoding="utf-8")
+    outputs = header.partition("/** Outputs:")[2].partition("} controller_outputs;")[0]
+    assert re.findall(r"controller_real (\w+);", outputs) == ["voltage", "doubled", "y"]
+
+
 REFUSED = {
     "continuous": (
         lambda: Diagram(
@@ -287,6 +302,24 @@ REFUSED = {
     ),
     "no ticks": (lambda: Diagram("loop", Gain(gain=2.0, name="twice")(Step(times=0.1, values=1.0))), "loop"),
 }
+
+
+@pytest.mark.parametrize(
+    "export",
+    [
+        lambda loop, controller, path: loop.to_c(path, subsystem="controller"),
+        lambda loop, controller, path: to_c(controller, path),
+        lambda loop, controller, path: build(loop, subsystem="controller"),
+    ],
+)
+def test_a_block_that_cannot_leave_is_named_by_its_whole_path(export, tmp_path):
+    @subsystem(sample_time=0.1)
+    def controller(r):
+        return PythonFunction(float, arguments=("u",), name="mdead")(r)
+
+    loop = Diagram("loop", controller(Step(times=0.1, values=1.0)))
+    with pytest.raises(DefinitionError, match=r"^controller\.mdead: Python evaluates it"):
+        export(loop, controller, tmp_path)
 
 
 @pytest.mark.parametrize("reason", [*REFUSED])
