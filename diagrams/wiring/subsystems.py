@@ -184,7 +184,13 @@ class SubsystemCall(ShownAsTable, Wireable):
             outer.append(self)
 
     def _name_results(self, result: object) -> dict[str, Signal]:
-        if result is None or (isinstance(result, Mapping) and not result):  # it puts nothing out
+        if result is None:
+            raise WiringError(
+                "its function returns nothing. End it with return and its outputs, such as return u; with return () if "
+                "it has none, as one that only records or stops a run.",
+                block=self.label,
+            )
+        if isinstance(result, Mapping) and not result:
             return {}
         if is_bus(result):
             signals = flatten(result, self.label, "")
@@ -218,7 +224,10 @@ class SubsystemCall(ShownAsTable, Wireable):
 
     def _signal(self) -> Signal:
         if not self.results:
-            raise WiringError("its function returns no signal. End it with return, and the outputs.", block=self.label)
+            raise WiringError(
+                "it has no outputs: its function ends with return (). Return signals there to use them.",
+                block=self.label,
+            )
         if len(self.results) != 1:
             raise WiringError(
                 f"it has {len(self.results)} outputs ({', '.join(self.results) or 'none'}); unpack the call, or name "
@@ -295,7 +304,7 @@ def subsystem(
     """Make a subsystem of a function of signals.
 
     An argument may be a bus, a mapping of signals by name, and so may the result: each signal is a port of the
-    subsystem.
+    subsystem. A function without outputs ends with ``return ()``.
 
     Parameters
     ----------

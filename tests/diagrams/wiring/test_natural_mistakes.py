@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Gain, Input, LoopwrightError, State, Step
+from loopwright.blocks import Block, Gain, Input, LoopwrightError, Sine, State, Step
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import build
 from loopwright.frequency import margins
@@ -40,6 +40,17 @@ def nothing(e):
     Gain(gain=1.0)(e)
 
 
+@subsystem(sample_time=0.01)
+def watched(e):
+    Gain(gain=2.0, name="double")(e)
+    return ()
+
+
+def test_a_subsystem_without_outputs_says_so_by_an_empty_tuple_and_runs():
+    run = Diagram("t", watched(Sine(amplitude=3.0, frequency=2.0))).simulate(0.1, progress=False)
+    assert run["watched.double.y"][-1] == pytest.approx(6.0 * math.sin(0.4 * math.pi), rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("ask", "said"),
     [
@@ -52,8 +63,10 @@ def nothing(e):
         (lambda: Diagram("t", Vessel()(STEP)), r"read it in an equation as u\.flow\. Correct"),
         (
             lambda: Diagram("t", Gain(gain=1.0)(nothing(STEP))),
-            r"nothing: its function returns no signal. End it with return",
+            r"nothing: its function returns nothing. End it with return and its outputs, such as return u",
         ),
+        (lambda: nothing(STEP), r"nothing: its function returns nothing. .* with return \(\) if it has none"),
+        (lambda: Diagram("t", Gain(gain=1.0)(watched(STEP))), r"watched: it has no outputs: its function ends with"),
         (lambda: Diagram("t", Leak()(STEP)).trim(), r"derivative of the diagram's equations that is not finite"),
         (lambda: build(Leak, "leak.fmu"), r"found the class Leak; expected a block, such as Leak\(…\)"),
         (lambda: drive().simulate(0.1, dt=0.01), r"no argument 'dt'\. Did you mean step=… \(seconds\)\?"),
@@ -65,7 +78,7 @@ def test_a_natural_mistake_is_told_with_what_to_write(ask, said):
 
 
 def test_a_call_of_a_subsystem_prints_as_that():
-    assert repr(nothing(STEP)) == "<call of nothing>"
+    assert repr(watched(STEP)) == "<call of watched>"
 
 
 def test_a_run_of_some_signals_names_those_that_it_has():
