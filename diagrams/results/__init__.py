@@ -11,9 +11,10 @@ from .saved_state import RunState, check_fits, layout_of, not_open_error
 from .signal_names import resolve
 from .step_info import StepInfo
 from .step_measures import ExpectedStep, is_at_rest, measure_step
-from .stored import Occurrence, Stopped
+from .stored import SWEEP_HEADER, Occurrence, Stopped
 
 __all__ = [
+    "SWEEP_HEADER",
     "ExpectedStep",
     "FreeDirection",
     "Occurrence",

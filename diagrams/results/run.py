@@ -61,6 +61,23 @@ WAYS = {
     **dict.fromkeys(("signals", "keys", "channels", "logs"), "run.names, which has all signals"),
 }
 """What to write for names that users of other tools look for in a run."""
+_CLASS_WAYS = dict.fromkeys(
+    ("load", "read", "restore", "from_file", "from_folder"),
+    'Run.open("folder"), which reads what run.save("folder") and simulate(…, to="folder") write',
+) | dict.fromkeys(
+    ("from_csv", "read_csv", "from_pandas"),
+    "pandas.read_csv to look at a CSV file, or the block Recorded.from_csv to wire it",
+)
+"""The same for the class."""
+
+
+class _RunClass(type):
+    """Class of `Run`: a name that it hasn't is an error with what to write."""
+
+    if not TYPE_CHECKING:  # a type checker knows all members
+
+        def __getattr__(cls, name):
+            raise missing_member(cls, name, "the class Run", _CLASS_WAYS)
 
 
 @explain_calls
@@ -94,7 +111,7 @@ class Snapshot:
 
 @explain_calls
 @dataclass(frozen=True, eq=False)
-class Run(ShownAsTable):
+class Run(ShownAsTable, metaclass=_RunClass):
     """A run: the outputs of the blocks, and the states, at the instants that were recorded.
 
     ``run.t`` holds the times in s. ``run["xi"]`` is an array with one row per sample, by a wire's name, by a port's

@@ -32,6 +32,7 @@ from ...blocks.core import (
     Layout,
     OptionError,
     check_argument,
+    count_of,
     describe_disk_error,
     explain_calls,
     explain_disk_errors,
@@ -42,6 +43,8 @@ from .recorded_signals import RecordedSignals
 
 FORMAT, VERSION = "loopwright run", 1
 HEADER, ROWS, EVENTS, END = "header.json", "rows.f64", "events.jsonl", "end.json"
+SWEEP_HEADER = "sweep.json"
+"""Header in the folder of a sweep, which is no run."""
 _BLOCK = 2**24  # bytes written at once
 
 OTHER_PATH = "Choose another path."
@@ -289,6 +292,26 @@ class Stored:
         )
 
 
+def _describe_other(folder: Path) -> tuple[str, str]:
+    """Return what is where a run was looked for, and the next step."""
+    if not folder.exists():
+        return "nothing", "Check the path."
+    if folder.is_file():
+        step = "Give the folder of a run; exported files are read by pandas, and by Recorded.from_csv as a source."
+        return "a file", step
+    if (folder / SWEEP_HEADER).is_file():
+        return "a sweep", f"diagram.sweep(…, to={os.fspath(folder)!r}) with the same samples reads it."
+    runs = sorted(one.name for one in folder.iterdir() if (one / HEADER).is_file())
+    if runs:
+        return (
+            f"a folder of {count_of(len(runs), 'run')}",
+            f"Open one of them: Run.open({os.fspath(folder / runs[0])!r}).",
+        )
+    if (folder / HEADER).is_file():
+        return "a damaged header", "Simulate again, or copy the folder again."
+    return "a folder of other files", "Check the path."
+
+
 def read(path: PathLike) -> Stored:
     """Open a stored run."""
     check_argument(path, kinds.path, "path", "Run.open")
@@ -301,9 +324,10 @@ def read(path: PathLike) -> Stored:
         step = "Copy it to a folder that you can read."
         raise OptionError(f"the run at {place!r} can't be read: {describe_disk_error(error, place, step)}") from error
     except (OSError, ValueError, KeyError, TypeError) as error:
+        found, step = _describe_other(folder)
         raise OptionError(
-            f"found no stored run at {place!r}; expected a folder with a {HEADER}, as run.save(path) and "
-            "simulate(…, to=path) write it. Check the path."
+            f"found {found} at {place!r}, and no stored run; expected a folder with a {HEADER}, as run.save(path) and "
+            f"simulate(…, to=path) write it. {step}"
         ) from error
     if head["version"] != VERSION:
         raise OptionError(

@@ -13,11 +13,12 @@ from zipfile import BadZipFile
 import numpy as np
 
 from ...blocks.core import OptionError, explain_disk_errors, replace_file, write_text
+from ..results import SWEEP_HEADER
 from .outcome import WORKER_ENDED, Failure, SampleOutcome
 from .revision import Parts, digest_of
 from .sweep_differences import describe_differences
 
-HEAD = "sweep.json"
+HEAD = SWEEP_HEADER
 _FORMAT = 2
 _EVERY = 1.0  # s between two parts
 

@@ -198,8 +198,28 @@ def test_what_is_no_run_does_not_open(tmp_path):
     for content in (None, "no JSON", "[]", '{"format": "other"}'):
         if content:
             (tmp_path / "header.json").write_text(content)
-        with pytest.raises(OptionError, match=r"found no stored run at .* Check the path"):
+        step = r"Simulate again" if content else r"Check the path"
+        with pytest.raises(OptionError, match=rf"and no stored run; expected a folder .* {step}"):
             Run.open(tmp_path)
+
+
+def test_what_opens_in_another_way_says_in_which(waves, tmp_path):
+    waves.save(tmp_path / "runs" / "first")
+    with pytest.raises(OptionError, match=r"found a folder of 1 run at .*Run\.open\('.*runs.first'\)"):
+        Run.open(tmp_path / "runs")
+    waves.to_csv(tmp_path / "waves.csv", "late")
+    with pytest.raises(OptionError, match=r"found a file at .* are read by pandas, and by Recorded\.from_csv"):
+        Run.open(tmp_path / "waves.csv")
+    with pytest.raises(OptionError, match=r"found nothing at .* Check the path"):
+        Run.open(tmp_path / "nowhere")
+    (tmp_path / "sweep.json").write_text("{}")
+    with pytest.raises(OptionError, match=r"found a sweep at .* diagram\.sweep\(…, to="):
+        Run.open(tmp_path)
+    with pytest.raises(AttributeError, match=r"the class Run has no 'load'\. Write Run\.open\(\"folder\"\)"):
+        _ = Run.load
+    with pytest.raises(AttributeError, match=r"the class Run has no 'from_csv'\. Write pandas\.read_csv"):
+        _ = Run.from_csv
+    assert not hasattr(Run, "load")
 
 
 def test_a_run_of_a_later_format_says_which_loopwright_reads_it(waves, tmp_path):
