@@ -96,6 +96,7 @@ class EventMode:
         """Settle the events at the start, where the FMU is in Event Mode after its initialization."""
         self._is_fresh, self.next_event = True, math.inf
         for clock in self.clocks:
+            clock.next = math.inf  # that of an earlier run, if any
             if clock.variable.is_periodic and clock.variable.interval is not None:
                 clock.start(t, clock.variable.interval, clock.variable.shift)
         self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic or c.variable.interval is None])

@@ -113,22 +113,40 @@ def test_a_clock_that_ticks_very_often_is_told_with_its_rate(folder, step, every
     assert all("its clock beat) every 2e-05 s, about 5e+03 times in a step of 0.1 s" in m for m in told)
 
 
-def test_a_countdown_clock_ticks_when_the_fmu_says(folder):
-    """From the time event at 0.25 s on, the FMU counts down 0.18 s, once."""
+@pytest.fixture(scope="module")
+def countdown(folder):
+    """From the time event at 0.25 s on, the FMU counts down 0.18 s, once, if its input is positive."""
     clock = CLOCK.replace('"constant" intervalDecimal="0.15"', '"countdown"')
     counts = """
 int fmi3GetIntervalDecimal(void *p, const unsigned vr[], size_t n, double v[], int q[]) {
-    instance *c = p; bool now = c->mode == 1 && fabs(c->t - 0.25) < 1e-9; v[0] = 0.18; q[0] = now ? 2 : c->t > 0.25; return 0; }
+    instance *c = p; bool now = c->mode == 1 && fabs(c->t - 0.25) < 1e-9 && c->u > 0;
+    v[0] = 0.18; q[0] = now ? 2 : c->t > 0.25; return 0; }
 int fmi3SetClock(void *p, const unsigned vr[], size_t n, const bool v[]) {
     instance *c = p; c->beats++; c->level = c->t; return c->mode == 1 && vr[0] == 8 ? 0 : 3; }
 int unused("""
     source = EVENTS.replace("int fmi3SetClock(", counts)
-    file = small_fmu(
+    return small_fmu(
         folder, "fmi3", source, MODEL.format(clock=clock, outputs=OUTPUTS, variable="true"), name="countdown"
     )
-    run = simulate(Fmu(file, name="plant"), level=Constant(value=0.0))
+
+
+def test_a_countdown_clock_ticks_when_the_fmu_says(countdown):
+    run = simulate(Fmu(countdown, name="plant"), level=Constant(value=0.0))
     assert run["plant.beats"].tolist() == [0.0] * 5 + [1.0] * 6
     assert run["plant.seen"][-1] == pytest.approx(0.43, abs=1e-12)
+
+
+def test_a_countdown_of_an_earlier_start_is_over(countdown):
+    beats = []
+    with Fmu(countdown, name="plant", start={"u": 1.0}).instantiate([], None) as one:
+        one.bind(np.zeros(0), np.zeros(6))
+        for end in (0.4, 0.8):  # the first one counts down to 0.43 s
+            one.begin()
+            one.step(0.0, end)
+            beats += one.values(["beats"]).tolist()
+            one.reset()
+            one.initialize(None, values={"u": 0.0})
+    assert beats == [0.0, 0.0]
 
 
 def test_a_tunable_parameter_changes_in_event_mode(folder):
