@@ -6,10 +6,13 @@ import re
 import runpy
 from collections import defaultdict
 from functools import cache
+from inspect import isclass
 from pathlib import Path
 
 import pytest
 
+import loopwright
+from loopwright.blocks.core import errors
 from support.sources import ROOMS, ROOT, SOURCES, find_nodes
 
 PAGE = ROOT / "docs" / "explanation" / "architecture.md"
@@ -286,3 +289,17 @@ def test_the_table_of_sizes_has_every_sub_package_and_counts_its_lines():
     assert (
         sizes["count_code"]('"""Text."""\n\n# why\nx = """a\nb"""\n\n\ndef f():\n    """Text."""\n    return x\n') == 4
     )
+
+
+FOLDERS = {"blocks": "blocks", "fmus": "fmus", "diagrams": "diagrams"}
+FOLDERS |= {"frequency": "diagrams/frequency", "sweeps": "diagrams/sweeps"}
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_an_error_is_importable_where_it_is_raised(package):
+    known = {name for name, value in vars(errors).items() if isclass(value)} - {"LoopwrightError"}
+    files = [path for path in SOURCES if (ROOT / FOLDERS[package]) in path.parents]
+    calls = [node.func for path in files for node in find_nodes(path, ast.Call)]
+    raised = {called.id for called in calls if isinstance(called, ast.Name)} & known
+    assert raised
+    assert raised <= set(getattr(loopwright, package).__all__)

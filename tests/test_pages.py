@@ -258,6 +258,7 @@ def test_a_notebook_with_old_numbers_is_noticed(stored, made, fresh):
         check_printed(notebook(stored), notebook(made))
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", QUICK)
 def test_the_code_of_a_notebook_runs_and_prints_what_the_notebook_holds(name, monkeypatch):
     import nbformat

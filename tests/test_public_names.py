@@ -29,8 +29,6 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = [
     name for name in loopwright.__all__ if inspect.ismodule(getattr(loopwright, name)) and name != "experiments"
 ]
-FOLDERS = {"blocks": "blocks", "fmus": "fmus", "diagrams": "diagrams"}
-FOLDERS |= {"frequency": "diagrams/frequency", "sweeps": "diagrams/sweeps"}
 
 
 def test_the_front_door_has_the_names_that_programs_begin_with():
@@ -50,24 +48,6 @@ def test_a_name_has_one_place_but_for_errors_which_are_where_they_are_raised():
             places.setdefault(name, []).append(package)
     twice = {name for name, found in places.items() if len(found) > 1}
     assert all(issubclass(getattr(errors, name), loopwright.LoopwrightError) for name in twice)
-
-
-def raised_in(folder):
-    """Return the errors that the sources of a folder make."""
-    known = {name for name, value in vars(errors).items() if inspect.isclass(value)} - {"LoopwrightError"}
-    return {
-        node.func.id
-        for path in (ROOT / folder).rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in known
-    }
-
-
-@pytest.mark.parametrize("package", FOLDERS)
-def test_an_error_is_importable_where_it_is_raised(package):
-    raised = raised_in(FOLDERS[package])
-    assert raised
-    assert raised <= set(getattr(loopwright, package).__all__)
 
 
 def test_what_only_annotates_is_in_types():

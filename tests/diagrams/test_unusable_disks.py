@@ -161,6 +161,7 @@ for act in (
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="a working folder can't be removed on Windows")
 def test_a_working_folder_that_was_removed(tmp_path):
     """Whatever needs none works; whatever does says what is missing."""

@@ -54,11 +54,14 @@ def _trim(folder):
 
 
 def _key(version, command, place):
-    folders = [Path(argument[2:]) for argument in command if argument.startswith("-I") and argument != "-I."]
-    headers = [file for folder in folders for file in sorted(folder.glob("*.h"))]
+    includes = [argument for argument in command if argument.startswith("-I") and argument != "-I."]
+    headers = [file for argument in includes for file in sorted(Path(argument[2:]).glob("*.h"))]
     sources = sorted(file for file in place.iterdir() if file.is_file())
     named = [(file.name.encode(), file.read_bytes()) for file in (*headers, *sources)]
+    given = [
+        argument for argument in command[1:] if argument not in includes
+    ]  # folders differ from checkout to checkout
     digest = hashlib.sha256()
-    for part in (version.encode(), *map(os.fsencode, command[1:]), *(part for pair in named for part in pair)):
+    for part in (version.encode(), *map(os.fsencode, given), *(part for pair in named for part in pair)):
         digest.update(f"{len(part)}:".encode() + part)
     return digest.hexdigest()

@@ -64,6 +64,7 @@ def count_operations(diagram):
     return sum(t.function.n_instructions() for t in diagram.wired.checked.traced.values() if t.inputs)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     "block",
     [lambda seed: Gain(gain=matrix(seed)), lambda seed: Closed(), lambda seed: Own(A=matrix(seed))],

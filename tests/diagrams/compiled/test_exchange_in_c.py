@@ -244,6 +244,7 @@ def braked(end):
             torque, valve = 1e7, "rise"
 
 
+@pytest.mark.slow
 def test_an_anti_lock_brake_whose_car_is_an_fmu(cache, tmp_path, isolate):
     """A valve switches thousands of times a second: the torque into the FMU has kinks there, and no jumps."""
     file = build(Car(name="car"), out=tmp_path / "car.fmu")

@@ -35,7 +35,7 @@ def expected(period, ticks):
 
 @pytest.mark.parametrize("form", ["auto", True])
 @pytest.mark.parametrize("continuous", [False, True])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_each_of_22_subsystems_acts_at_its_ticks(monkeypatch, all_in_c, form, continuous):
     monkeypatch.setattr(clock_sets, "_MOST_SETS", 10_000)
     clock_sets._sets_of.cache_clear()

@@ -126,7 +126,7 @@ def points(period, end, offset=Fraction(0)):
 )
 @pytest.mark.parametrize("end", [26 * MS, Fraction(263, 10) * MS])
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_each_plant_steps_at_its_own_ticks_with_inputs_held_from_there(folder, fmi, end, isolate, solved):
     """Inputs are t, 2 t, -t and 3 t at the plant's last tick; the run ends within steps of three of the plants."""
     file = zoo_fmu(folder, fmi)
@@ -367,6 +367,7 @@ def test_isolated_plants_whose_ticks_meet_step_at_the_same_time(folder, meeting)
     np.testing.assert_allclose(run["a.y"], integral(points(4 * MS, 20 * MS), (), lambda k: k, run.t), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_fused_plants_step_at_their_own_ticks(cache):
     slow = Fmu(build_fmu(mass_spring_damper()), name="slow", stepping=StepOptions(communication_step=4 * MS))
     fast = Fmu(build_fmu(mass_spring_damper()), name="fast")
@@ -490,7 +491,7 @@ def chain(file, *more, isolate=None, fault=None):
 
 @pytest.mark.parametrize("isolate", [True, False])
 @pytest.mark.parametrize("coupling", SCHEMES, ids=NAMES)
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_coupled_plants_step_in_c_s_loop(folder, coupling, isolate):
     """Ticks are at 0, 5, 15, 25, … ms and the end. b gets a of the step's end, or the mean of both ends.
 

@@ -103,6 +103,7 @@ def root(function, near):
     return brentq(function, 0.7 * near, 1.3 * near, xtol=1e-300, rtol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "method"),
     [

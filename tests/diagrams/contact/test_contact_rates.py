@@ -271,6 +271,7 @@ def test_an_arm_with_a_slow_force_sensor_has_the_limit_of_its_own_matrices_and_o
     assert found.below.measured < 0.0 < found.above.measured
 
 
+@pytest.mark.slow
 def test_ports_of_an_fmu_whose_names_have_dots_are_those_of_a_contact():
     names = {"external_force": "tool.force", "position": "tool.position", "velocity": "tool.velocity"}
     arm, push = Fmu(scara.build(), name="arm", rename=names), Constant(value=(0.0, 0.0), unit="N", name="push")

@@ -120,6 +120,7 @@ def test_an_arm_that_is_lighter_than_twice_the_impedance_has_no_limit_of_mass():
     assert np.all(np.asarray(heavy) > 2 * IMPEDANCE["perp"])
 
 
+@pytest.mark.slow
 def test_another_tool_of_an_arm_without_friction_has_a_limit():
     """Its acceleration has no slope but that by the forces: what it has by its states is rounding of zero.
 

@@ -115,7 +115,7 @@ def test_a_users_block_in_model_exchange_beside_an_fmu_in_co_simulation(cache):
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.5])  # plain repetition diverges from 1 on
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_iteration_solves_a_loop_of_direct_feedthrough_between_two_fmus(cache, share):
     signals = ("a.position", "b.position", "a.acceleration", "b.acceleration")
     errors = [

@@ -380,6 +380,7 @@ int main(void) {{
 """
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("make", [solved, between])
 def test_with_the_loop_of_runs_it_has_the_bits_of_rk4(make, tmp_path):
     diagram = make()

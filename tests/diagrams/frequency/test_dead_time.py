@@ -243,6 +243,7 @@ def test_two_ways_without_a_state_are_stable_for_all_delays_only_if_their_gains_
         assert (diagram.linearize().characteristic.count_unstable() == 0) == stable
 
 
+@pytest.mark.slow
 def test_python_control_draws_it_exactly_and_gets_no_wrong_matrices():
     diagram, L, _ = one_lag()
     loop = diagram.linearize().loop("u")
@@ -373,6 +374,7 @@ def neutral(k, a, b, tau):
     return Diagram("d", late(plant(u)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("k", "a", "b", "tau"), [(0.4, 2.0, 1.0, 0.5), slow(0.9, 2.0, 1.0, 0.5), slow(0.3, 3.0, 1.0, 2.0)]
 )
@@ -453,6 +455,7 @@ def test_roots_are_counted_where_ways_without_a_state_cancel_each_other_for_ever
     assert DelayMatrices(np.array([[1.0 - f[0, 0] + 0.01]]), G, C, H, system.tau).count_unstable() == 1
 
 
+@pytest.mark.slow
 def test_a_smith_predictor_with_feedthrough_to_two_delays_is_not_neutral_and_keeps_its_gain_margin():
     """C e^(−17 s) P/(1 + C P (1 − e^(−15 s))): the controller feeds two delays at once, but no way back is without a state."""
     plant, late = rational([1.0], [20.0, 1.0], "plant"), delay(17.0)
@@ -527,7 +530,7 @@ def test_pade_of_a_sampled_diagram_is_refused():
 
 
 @pytest.mark.parametrize("ki", [0.05, 0.1, 0.15, 0.2, 0.3])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_an_integrator_behind_a_predictor_is_a_root_at_zero_whatever_the_gain(ki):
     """A Smith predictor whose PI cancels the lag: L = a e^(-8 s) / (s + a (1 - e^(-8 s))), a = 2 ki, with a pole at 0.
 
@@ -581,6 +584,7 @@ def test_only_crossings_that_may_decide_are_refined_of_a_response_that_passes_ze
     assert len(calls) < 100 + 15 * len(found)  # one root after the other took 20 more for each turn
 
 
+@pytest.mark.slow
 def test_of_many_crossings_those_that_can_not_decide_are_left_out(monkeypatch):
     """A model of the dead time that is 0.5 % too long: L = 0.3 (1 + e^(−8 s) − e^(−8.04 s))/s crosses at each turn."""
     calls, response = list[int](), DelayedRealization.response

@@ -263,6 +263,7 @@ def test_slower_loops_need_a_clock_at_the_wire():
         Diagram("lag", lag((-1.0 * lag.y).named("u"))).linearize().loop("u", slow="open")
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_too_large_is_not_confirmed(monkeypatch, model):
     L = model.loop("voltage", lifted=True)
     nearer = lambda r, omega: 0.25 * np.eye(len(r.D)) + sensitivity_at(r, omega) / 2  # noqa: E731

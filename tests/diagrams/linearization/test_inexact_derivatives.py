@@ -71,6 +71,7 @@ def held():
     return expm(np.block([[A, B], [np.zeros((1, 3))]]) * DT)[:2]
 
 
+@pytest.mark.slow
 def test_a_model_along_a_motion_is_as_exact_as_the_derivatives_and_takes_no_more_of_them(file3, monkeypatch):
     calls, differentiate = [], PointEvaluator.differentiate
     monkeypatch.setattr(PointEvaluator, "differentiate", lambda *a: (calls.append(a[2]), differentiate(*a))[1])

@@ -381,6 +381,7 @@ def test_encoders_and_quantizers_have_their_mean_slope_without_being_asked():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stairs", [None, pytest.param("gain", marks=pytest.mark.slow)])
 def test_a_mean_slope_of_a_converter_meets_requirements_and_one_that_was_asked_for_does_not(stairs):
     reports = {s: servo(0.0).report(only=("inner", "poles"), stairs=s) for s in (stairs, "zero")}

@@ -123,7 +123,7 @@ class Dated(Block):
     ],
     ids=["its motion", "its derivatives"],
 )
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_an_fmu_at_rest_that_follows_time_is_integrated(start, transition, end, cache):
     model = exchanged(build(Dated()), gain=0.0, **start).linearize()
     assert model.A[0, 0] == pytest.approx(transition, rel=1e-9)

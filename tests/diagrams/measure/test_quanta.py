@@ -82,6 +82,7 @@ def section(report, key):
     return next(s for s in report.sections if s.key == key)
 
 
+@pytest.mark.slow
 def test_a_report_steps_and_injects_many_quanta():
     report = servo().report(only=("inner", "steps", "injection"))
     numbers, expected = report.numbers(), by_hand()
@@ -126,6 +127,7 @@ def describing_function(a):
     return 4.0 / (np.pi * a) * float(np.sum(np.sqrt(1.0 - (edges / a) ** 2)))
 
 
+@pytest.mark.slow
 def test_a_limit_cycle_is_flagged_and_measured_in_quanta():
     gain = 5.0
     expected = brentq(lambda a: describing_function(a) - 6.0 / gain, 1.0 / math.sqrt(2.0), 1.49)

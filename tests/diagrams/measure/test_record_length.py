@@ -121,7 +121,7 @@ def noisy_loop(variance, seed):
 
 
 @pytest.mark.parametrize("variance", [1e-8, 1e-4])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_a_loop_with_noise_settles_with_an_uncertainty_that_holds(variance):
     for seed in (1, 2):
         found = noisy_loop(variance, seed).frequency_response("u", [8.0], amplitude=1.0)

@@ -262,7 +262,7 @@ def test_with_the_linear_model_beside_it_a_slow_tail_costs_no_accuracy():
 
 
 @pytest.mark.parametrize("samples", [20, 50, 1000])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_what_lies_between_the_samples_is_in_the_tolerance_of_a_peak(samples):
     """The answer of T = (3 s + 40)/(s² + 3 s + 40) has its peak where its slope is zero."""
     s = control.tf("s")

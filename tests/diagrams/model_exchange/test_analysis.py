@@ -165,7 +165,7 @@ def test_a_report_of_fig3_has_the_numbers_of_co_simulation(cache, tmp_path):
         assert exchanged[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_a_loop_has_its_slopes_by_the_parameters_of_its_controller(file):
     plant = Fmu(file, interface="model_exchange", name="plant")
 
@@ -188,6 +188,7 @@ def test_a_loop_has_its_slopes_by_the_parameters_of_its_controller(file):
     assert {"controller.pi.kp", "controller.pi.ki"}.isdisjoint(found.without_effect)
 
 
+@pytest.mark.drawn(1)
 def test_a_loop_has_its_slopes_by_parameters_of_the_fmu(file):
     plant = Fmu(file, interface="model_exchange", name="plant", start={"position": 0.0})
     force = PID(kp=20.0, ki=30.0, name="pi")(0.0, plant.position).named("u")

@@ -85,7 +85,7 @@ def fmi(request):
 
 
 @pytest.mark.parametrize("interface", ["model_exchange", "co_simulation", "block"])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_a_driven_van_der_pol_oscillator_meets_its_equation_in_all_three_ways(cache, tmp_path, fmi, interface):
     model = DrivenVanDerPol(name="oscillator")
     if interface == "block":

@@ -22,6 +22,7 @@ SHAPES |= {"v_par": (), "v_perp": (), "theta": (), "q": (), "eta_p": (3,), "xi_p
 # --- all signals, at every tick ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(2)
 @EVERY
 def test_every_tick_agrees_with_the_independent_solution(runs, solutions, letter, options):
     experiment, run = runs(letter, **options)

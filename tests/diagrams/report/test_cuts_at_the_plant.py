@@ -208,6 +208,7 @@ def test_a_pi_law_of_single_blocks_is_decided():
     assert {verdict for verdict, _ in verdicts(report).values()} == {Verdict.PASSED}
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("wire", ["e", "y"])
 @pytest.mark.parametrize(("ms", "verdict"), [(2.6, Verdict.PASSED), (2.3, Verdict.FAILED)])
 def test_an_error_that_enters_a_sampled_pi_law_is_one_wire(wire, ms, verdict):

@@ -223,6 +223,7 @@ def test_every_number_has_a_definition_and_a_confirmation(name):
         assert number.given or number.confirmed_by.strip(), path
 
 
+@pytest.mark.slow
 def test_maps_and_admittances_have_no_transparent_faces_whose_edges_a_pdf_shows():
     k, b = np.geomspace(10.0, 1e5, 30), np.geomspace(0.1, 7.0, 20)
     stable = np.log10(k)[None, :] - 3.0 - np.log10(b)[:, None]

@@ -58,6 +58,7 @@ def line_about(report, wire):
     return line
 
 
+@pytest.mark.slow
 def test_a_general_limit_does_not_apply_between_ticks_where_the_loop_is_judged_at_another_wire():
     report, results = analysed()
     assert report.review.verdict is Verdict.PASSED, report.review.results

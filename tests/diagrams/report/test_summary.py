@@ -165,6 +165,7 @@ def many(count):
     return Diagram("many", *outputs)
 
 
+@pytest.mark.slow
 def test_with_many_loops_the_weakest_are_shown_and_the_others_named():
     report = analyse(many(8), only=("inner",), requirements=Requirements(phase_margin_deg=30, ms=2.5, disk_margin=0.3))
     (summary,) = (s for s in report.sections if s.key == "summary")
@@ -199,6 +200,7 @@ def small(height):
     return figure
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [pytest.param(30, marks=pytest.mark.slow), 48])
 def test_a_summary_has_two_sheets_where_smaller_figures_suffice_and_is_whole(rows, tmp_path):
     plots = tuple(Plot(f"p{i}{k}", f"Caption {i}{k}.", small(1.4), group=str(i)) for i in range(6) for k in "ab")

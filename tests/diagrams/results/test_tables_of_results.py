@@ -92,6 +92,7 @@ def test_margins_have_their_gains_in_decibels_too(diagram):
     assert str(unstable).startswith("margins: none, as the closed loop is unstable\n")
 
 
+@pytest.mark.slow
 def test_the_review_is_the_table_of_the_first_page(diagram):
     limits = {"ms": 2.0, "phase_margin_deg": 30.0}
     report = diagram.report(only=("inner", "poles"), requirements=Requirements(**limits))

@@ -62,6 +62,7 @@ def test_both_processes_make_parts_and_tell_of_them(parts):
     assert sorted(told) == [f"making {key}" for key in KEYS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "way", ["ends", *(pytest.param(way, marks=pytest.mark.slow) for way in ("fails", "can't be sent"))]
 )

@@ -38,7 +38,7 @@ def functions_of(made):
     ]
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("compiled", [False, "auto", True])
 @pytest.mark.parametrize("make", [sampled, continuous, with_events])
 def test_a_diagram_that_has_run_is_not_kept(make, compiled):

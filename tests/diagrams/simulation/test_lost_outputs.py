@@ -171,7 +171,7 @@ class Emptying(Block):
 
 
 @pytest.mark.parametrize("lanes", [True, False])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_an_fmu_that_was_built_here_refuses_it_itself_in_lanes_too(cache, lanes):
     plant = Fmu(build(Emptying()), name="plant")
 

@@ -424,7 +424,7 @@ def test_a_jump_that_is_no_event_ends_in_an_error_not_in_a_hang(name):
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 def test_an_error_in_the_rates_passes_through(name):
     def rate(x):
         if x < 0.4:

@@ -392,7 +392,7 @@ def test_equal_samples_are_cases_of_their_own():
     ("name", "ends", "said"),
     [
         ("dead.delay", (0.0, 0.9), "found a range from 0 to 0.9; expected values above 0 s"),
-        ("dead.delay", Box(-0.5, 0.9), "expected values above 0 s"),
+        pytest.param("dead.delay", Box(-0.5, 0.9), "expected values above 0 s", marks=pytest.mark.slow),
     ],
 )
 def test_a_range_with_an_end_that_the_parameter_refuses_is_refused_before_anything_is_computed(name, ends, said):

@@ -44,6 +44,7 @@ def test_an_operating_point_serves_the_diagram_with_the_cut():
     assert found.confirm().agrees
 
 
+@pytest.mark.slow
 def test_sensitivities_are_those_at_the_plants_input_too():
     """The slope by the plant's gain is that of differences by hand."""
     ms = [[peak(system(Z)) for system in smith_by_hand(gain)] for gain in (1.299, 1.3, 1.301)]

@@ -78,6 +78,7 @@ def test_the_path_of_an_fmu_holds_while_another_thread_loads_one(tmp_path, monke
         loading.result()
 
 
+@pytest.mark.slow
 def test_an_fmu_in_the_home_folder_is_fused_and_runs_in_lanes(tmp_path, monkeypatch):
     build(Root(), out=tmp_path / "root.fmu")
     monkeypatch.setenv("HOME", str(tmp_path))

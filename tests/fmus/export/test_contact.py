@@ -28,7 +28,7 @@ def path(fmi, request):
     return build_fmu(request.param(), fmi=fmi)
 
 
-@pytest.mark.drawn(8)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("integrator", [1, 2, 3])
 @pytest.mark.parametrize("h", [1.0, 0.01])
 def test_an_inelastic_impact_rests_in_contact_and_says_so(path, instance, integrator, h):
@@ -78,6 +78,7 @@ def test_an_importer_sees_an_indicator_leave_the_border(path, exchange):
     assert me.x[1] == 0.5
 
 
+@pytest.mark.drawn(2)
 def test_an_inelastic_impact_in_model_exchange_rests(path, exchange):
     """The ball falls, is stopped, and falls again from where it is: each time an event, until that is an error."""
     me, t = exchange(path).start(e=0.0), 0.4

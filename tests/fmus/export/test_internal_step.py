@@ -88,6 +88,7 @@ def test_other_parameters_in_a_run_are_compared_too():
     assert run_of(path, L=5e-5, integrator=3).messages == ()
 
 
+@pytest.mark.slow
 def test_a_very_stiff_model_gets_the_implicit_integrator():
     wall = Fmu(build(Wall()), name="wall")
     run = Diagram("stiff", wall(u=Step(times=2e-3, values=1.0))).simulate(5e-3, step=1e-3)

@@ -139,6 +139,7 @@ def test_cosimulation_in_ecos(ecospy, fmi):
     np.testing.assert_allclose(y, np.stack([s, v, 5.0 - v - 100.0 * s], axis=1), rtol=0, atol=5e-10)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("fmi", FMI)
 def test_vectors_in_ecos_as_scalars(ecospy, fmi):
     path, force = gantry.build(fmi=fmi, arrays=False), np.array([120.0, 90.0])
@@ -148,6 +149,7 @@ def test_vectors_in_ecos_as_scalars(ecospy, fmi):
     np.testing.assert_allclose(y, gantry_motion(t, force), rtol=0, atol=1e-11)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("fmi", FMI)
 def test_events_in_ecos(ecospy, fmi):
     t, y = ecos(ecospy, bouncing_ball.build(fmi=fmi), ADAPTIVE, ("height", "velocity", "bounces"), 200)

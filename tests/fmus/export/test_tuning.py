@@ -13,6 +13,7 @@ from loopwright.diagrams import experiments
 from loopwright.fmus import Fmu, FmuError, gantry, tune
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("fmi", [3, 2])
 def test_it_is_the_same_fmu_with_another_binary(fmi):
     given = gantry.build(fmi=fmi)

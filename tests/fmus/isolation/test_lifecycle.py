@@ -235,6 +235,7 @@ def test_a_loop_that_nobody_refers_to_any_more_has_no_process(tmp_path, uncollec
     assert count_processes() == (0, 0)
 
 
+@pytest.mark.slow
 def test_processes_that_only_garbage_holds_are_ended_before_many_are_there(folder, uncollected):
     plant = Fmu(zoo_fmu(folder, 3), name="plant", isolate=True)
     most = 0

@@ -80,6 +80,7 @@ def ball(file, T, n, **start):
 # --- gantry_contact ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_bounce_on_the_wall_is_half_a_damped_oscillation():
     # z alone, without friction and weight: M delta'' + d delta' + k delta = 0 from delta = 0 on, until the force ends at
     # omega_d tau = pi - 2 asin(zeta), and the mass leaves with e^(-zeta omega tau) of its speed
