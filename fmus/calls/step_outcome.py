@@ -52,11 +52,17 @@ class StepOutcome:
         if fmu.ends_run:  # an FMU that has ended need not give its outputs any more
             return self.termination(self.now.value, self.width.value, t)
         fmu.failed, fmu.fatal = status >= ERROR, status >= FATAL  # a call that is discarded changes nothing
+        if fmu.inputs:
+            names = ", ".join(v.name for v in fmu.inputs.values())
+            given, general = (
+                f"The inputs ({names}) were {self.vector.tolist()}. ",
+                "look at the last samples of error.run",
+            )
+        else:
+            given, general = "", "check its start values"
         return FmuRuntimeError(
-            f"{action} failed with {fmu.fmi.status_name(status)}{fmu.quote_messages()} The inputs "
-            f"({', '.join(v.name for v in fmu.inputs.values())}) were {self.vector.tolist()}. "
-            f"{advice or 'Look at the last samples of error.run, or take a smaller step.'}"
-            f"{fmu.fmi.describe_memory()}",
+            f"{action} failed with {fmu.fmi.status_name(status)}{fmu.quote_messages()} {given}"
+            f"{advice or f'Take a smaller step, or {general}.'}{fmu.fmi.describe_memory()}",
             block=fmu.setup.label,
             t=t,
         )
@@ -65,7 +71,7 @@ class StepOutcome:
         """Return the error of a step from t over h, both in s, that has failed with a status."""
         fmu, self.width.value = self._fmu, 0.0  # the instance stays where it was
         action = f"the step from t = {t:.9g} s by {h:g} s"
-        if status == PENDING:
+        if status == PENDING and not fmu.fmi.table.reports_step:
             action = f"{action} was still pending after {fmu.fmi.patience:g} s: it"
         if status != DISCARD:
             return self.report(action, status, t, self._beyond_the_end(t + h))

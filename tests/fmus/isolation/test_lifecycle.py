@@ -348,6 +348,16 @@ def test_states_are_freed_before_their_instance(folder, isolate, rollback, fault
     assert not [text for text in one.messages if "did not end well" in text]
 
 
+def test_a_step_behind_a_linear_model_fails_without_words_on_a_run(folder):
+    plant = Fmu(zoo_fmu(folder, 3, "step error"), name="plant", isolate=False)
+    with pytest.raises(FmuRuntimeError) as error:
+        plant.step_difference(0.1)
+    assert str(error.value) == (
+        "plant, t = 0 s: the step from t = 0 s by 0.1 s failed with fmi3Error. The FMU says: plant: error: this is an "
+        "error. Take a smaller step, or check its start values."
+    )
+
+
 def test_an_own_build_is_reset(msd, monkeypatch):
     one = LoadedFmu(setup_of(Fmu(msd, name="plant")))
     calls = []

@@ -300,6 +300,7 @@ def test_a_step_that_is_pending_for_ever_ends(host, place, fmi, word):
     """In FMI 2.0 it is asked for its status as long as a step may take; FMI 3.0 has no such status."""
     answer = host.run(zoo_fmu(place, fmi, f"step pending {T}"), isolate=SHORT)
     fail(answer, "FmuRuntimeError", KEPT, word)
+    assert ("pending" in answer["text"]) == (fmi == 2)
 
 
 @pytest.mark.slow
