@@ -41,8 +41,7 @@ ALLOWED = {
     "fmus/export/c_code.py": {"int "},  # in the C code that CasADi writes
     "fmus/export/compiler.py": {"windows"},  # the end of a platform's name
     "fmus/toolchain.py": {"windows"},  # the end of a platform's name
-    "fmus/export/inlined.py": {"#define LW_N_Z 0\n"},  # C code of our own
-    "fmus/export/own_sources.py": {'^#include "(.*)"$'},  # C code of our own
+    "fmus/export/own_sources.py": {"#define LW_N_Z 0\n", '^#include "(.*)"$'},  # C code of our own
     "fmus/export/target_code.py": {  # C code of our own
         r"^static [^\n;=]*\b(lw_\w+)\([^\n]*\) \{(?:[^\n]*\}|\n.*?^\})\n"
     },

@@ -2,15 +2,14 @@
 
 from .bound_calls import BoundCalls, Call
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
-from .fmu_setup import FmuSetup
 from .instance import FmuInstance
 from .library_functions import LibraryFunctions, exported_name, list_prototypes
 from .loaded_fmu import LoadedFmu
+from .loading import FmuSetup
 from .model_exchange_calls import order_questions
 from .model_exchange_instance import ModelExchangeInstance
 from .model_structure import is_smooth
-from .native_actions import NativeAction, NativeLook
-from .native_step import NativeStep, QuietStep, RemoteStep, SharedValues
+from .native_calls import NativeAction, NativeLook, NativeStep, QuietStep, RemoteStep, SharedValues
 from .saved_state import FmuState
 from .step_options import StepOptions, StepTime, check_offered
 from .step_outcome import NEAR

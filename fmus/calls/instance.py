@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from ...blocks.core import FmuProcessError, FmuRuntimeError
-from .fmu_setup import FmuSetup
 from .loaded_fmu import LoadedFmu
-from .native_step import NativeStep, RemoteStep
+from .loading import FmuSetup
+from .native_calls import NativeStep, RemoteStep
 from .saved_state import FmuState, SavedStates
 from .step import InstanceStep, StepMemory
 from .step_outcome import StepOutcome

@@ -10,7 +10,7 @@ import numpy as np
 from ...blocks.core import FmuRuntimeError
 from ..archive import FmuDescription, FmuVariable
 from .fmi_calls import FmiCalls
-from .fmu_setup import FmuSetup
+from .loading import FmuSetup
 from .text_values import is_readable, read_text, waits_for_initialization
 from .transfer import Transfer, is_kept
 

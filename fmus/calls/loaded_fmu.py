@@ -25,9 +25,8 @@ from ..host_state import FOLDER, HostState
 from ..isolation import Isolation
 from ..platform import is_built_here
 from .fmi_calls import FATAL, WARNING
-from .fmu_setup import FmuSetup
 from .instance_start import InstanceStart
-from .loading import load_calls
+from .loading import FmuSetup, load_calls
 from .message_log import MessageLog, clean_text, describe_end
 from .step_options import choose_modes
 from .text_values import (

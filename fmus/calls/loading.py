@@ -1,17 +1,59 @@
-"""Where the library of an FMU is loaded: in its own process, or in this one."""
+"""How an FMU is loaded: its setup, and where its library is loaded, in its own process or in this one."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..archive import FmuDescription, FmuVariable, ModelExchangeInfo, OtherVariable
 from ..isolation import Isolation, default_memory, give_back, take
+from ..platform import is_built_here
 from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FmiCalls
-from .fmu_setup import FmuSetup
 from .remote_calls import RemoteCalls
+from .step_options import StepOptions
+
+
+@dataclass(frozen=True, eq=False)
+class FmuSetup:
+    """All that the instances of a block's FMU know of the block. Start values are by the FMU's names, ports by theirs.
+
+    A block makes it when its FMU is loaded, and checks the file once for that.
+    """
+
+    label: str
+    """Name for messages."""
+    description: FmuDescription
+    start: Mapping[str, Any]
+    input_variables: Mapping[str, FmuVariable]
+    output_variables: Mapping[str, FmuVariable]
+    text_variables: Mapping[str, OtherVariable]
+    """Texts and binary data that are recorded in a run."""
+    stepping: StepOptions
+    isolate: bool | Isolation | None
+    """Whether it is loaded in its own process, or the limits of that process; None to decide by its origin."""
+    model_exchange_info: ModelExchangeInfo | None
+    """Its model exchange, with the dependencies that hold for it; None without one."""
+    dependencies: str
+    """Dependencies of its outputs and derivatives in model exchange: "declared" or "all"."""
+
+    @property
+    def process_limits(self) -> Isolation | None:
+        """Limits of the process in which it is loaded; None for this process.
+
+        An FMU that Loopwright has not built is loaded in its own process, unless its block says otherwise.
+        """
+        given = self.isolate
+        if given is None:
+            given = not is_built_here(self.description.digest)
+        if isinstance(given, Isolation):
+            return given
+        return Isolation() if given else None
+
 
 _CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""

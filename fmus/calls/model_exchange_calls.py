@@ -12,7 +12,7 @@ import numpy as np
 from ...blocks.core import EvaluationVectors
 from .bound_calls import BoundCalls, Call
 from .fmi_calls import WARNING, FmiCalls
-from .native_actions import ActionKind, NativeAction, call_action, copy_action, transfer_actions
+from .native_calls import ActionKind, NativeAction, call_action, copy_action, transfer_actions
 from .transfer import Transfer
 
 T = TypeVar("T")

@@ -16,11 +16,11 @@ from ..host_state import HostState
 from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
 from .event_calls import EventUpdate, check_next_time
 from .fmi_calls import MOST_ROUNDS
-from .fmu_setup import FmuSetup
 from .loaded_fmu import LoadedFmu
+from .loading import FmuSetup
 from .model_exchange_calls import Evaluation, Vector, call_actions
 from .model_structure import check_structure, is_smooth
-from .native_actions import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
+from .native_calls import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
 from .saved_state import StateFormat
 from .transfer import Transfer, UnfitError
 

@@ -16,12 +16,11 @@ import numpy as np
 
 from ...blocks.core import FmuRuntimeError
 from .bound_calls import BoundCalls, Call
-from .event_mode import EventMemory, EventMode
-from .event_pile import EventPile
+from .event_mode import EventMemory, EventMode, EventPile
 from .fmi_calls import DISCARD, WARNING
 from .input_slopes import InputSlopes
 from .loaded_fmu import LoadedFmu
-from .native_step import NativeStep, QuietStep, RemoteStep, address_of, share, transfer_at
+from .native_calls import NativeStep, QuietStep, RemoteStep, address_of, share, transfer_at
 from .saved_state import FmuState, SavedStates
 from .step_options import StepParts, parts_of_step
 from .step_outcome import NEAR, ROUNDED, StepOutcome

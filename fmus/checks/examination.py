@@ -24,8 +24,7 @@ from ..archive import (
 )
 from ..platform import native_platform
 from .diagnosis import FmuDiagnosis, FmuTrial, FmuVerdict
-from .exported_functions import missing_promises
-from .libraries import binaries_of, native_libraries, tuple_of
+from .libraries import binaries_of, missing_promises, native_libraries, tuple_of
 from .summary import INTERFACES, summarize
 from .trial import find_step, split_step, try_out
 from .validation import reason_not_to_run, validate

@@ -1,16 +1,14 @@
 """Export of a block as an FMU: equations, C code, model description, binaries."""
 
-from .c_names import unit_name
-from .c_text import c_number
+from .c_text import c_number, unit_name
 from .compiler import compile_shared, compile_webassembly, describe_compiler
 from .fmu_package import build_fmu, clear_cache
 from .from_block import build, model_spec, parameter_variable
-from .inlined import inline_model, own_functions
 from .loop_memory import Field, LoopMemory
 from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSlopes, LoopSpec, Placed, write_unit
 from .merged_plants import MergedPlant, PlacedPlant
 from .model_spec import INTEGRATORS, Integrator, ModelSpec, Variable, check_ascii
-from .own_sources import read_own_sources
+from .own_sources import inline_model, own_functions, read_own_sources
 from .python_fmu import build_python
 from .scalar_operations import Lookup, split_lookups
 from .target_code import write_target

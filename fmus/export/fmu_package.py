@@ -28,13 +28,11 @@ from ..toolchain import DIAGRAM_FLAGS, SUFFIXES, TARGETS, flags
 from .c_code import generate, read_fmu_sources
 from .compiler import Compiler, check_platform, compile_shared, find_compiler
 from .html_page import index_html
-from .loop_description import describe_loop, loop_page
-from .loop_entries import scalarize_loop
+from .loop_description import describe_loop, loop_page, scalarize_loop
 from .loop_fmu import generate_loop, read_loop_sources
 from .loop_spec import LoopSpec, write_unit
 from .model_description import describe_model
-from .model_spec import ModelSpec
-from .scalars import scalarize
+from .model_spec import ModelSpec, scalarize
 from .xml_elements import package_version
 from .xml_fmi2 import write_description2
 from .xml_fmi3 import build_description, write_description3

@@ -13,8 +13,7 @@ import numpy as np
 
 from ...blocks.core import Block
 from .equation_text import equations, number
-from .model_spec import ModelSpec, Variable
-from .scalars import scalarize
+from .model_spec import ModelSpec, Variable, scalarize
 from .variable_entries import Entry, layout
 
 _STYLE = """

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .c_expressions import OF_MATH
-from .c_templates import fill_template
-from .c_text import c_constant
+from .c_text import c_constant, fill_template
 from .elementary_tables import FUNCTIONS
 from .loop_spec import LoopSpec, write_unit
 from .target_members import NAMED, Member, Status, label_members, list_statuses, name_members

@@ -12,7 +12,7 @@ from functools import lru_cache
 from .c_code import OF_FMI, ORDER, start_table, variable_table
 from .c_text import c_array
 from .elementary_tables import read_fmu_source
-from .loop_entries import loop_layout, loop_rows, offered_clocks
+from .loop_description import loop_layout, loop_rows, offered_clocks
 from .loop_spec import LoopSpec, Placed, write_unit
 from .variable_entries import Entry
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from .c_templates import fill_template
-from .c_text import c_number
+from .c_text import c_number, fill_template
 from .loop_memory import Field
 from .own_sources import expand_sources, name_apart
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from .c_expressions import OF_TIME, NumberText
-from .c_templates import fill_template
-from .c_text import c_constant, fill_lines
+from .c_text import c_constant, fill_lines, fill_template
 from .elementary_tables import prepare_functions, prepare_single, read_fmu_source
 from .model_spec import Variable
 from .scalar_operations import Tables

@@ -8,8 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from .c_names import distinct, identifier
-from .c_text import in_comment
+from .c_text import distinct, identifier, in_comment
 from .model_spec import Variable
 
 Number = Literal["double", "float"]

@@ -12,8 +12,7 @@ import numpy as np
 
 from ...blocks.core import explain_calls
 from .c_expressions import Expressions, NumberText
-from .c_names import HELPERS, KEYWORDS, distinct, identifier
-from .c_text import c_constant, fill_lines, wrap_statements
+from .c_text import HELPERS, KEYWORDS, c_constant, distinct, fill_lines, identifier, wrap_statements
 from .scalar_operations import ScalarNode
 from .target_layout import INPUTS, PARAMETERS, STATES, TargetLayout, is_entry
 from .target_members import Member

@@ -37,9 +37,9 @@ from ..calls import FmuInstance, FmuSetup, ModelExchangeInstance, StepOptions, c
 from ..isolation import Isolation
 from ..platform import is_built_here
 from .fmu_point import FmuLinearization
+from .fmu_ports import PortMembers
 from .fmu_start_values import check_start, check_value, read_sized
 from .linearization import STEP, linear_model, step_difference
-from .port_members import PortMembers
 from .replacement import check_replacement
 
 INTERFACES = ("co_simulation", "model_exchange")

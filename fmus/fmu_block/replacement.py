@@ -27,7 +27,7 @@ from ...blocks.core import (
     same_unit,
 )
 from ..archive import FmuVariable
-from .port_members import PortMembers
+from .fmu_ports import PortMembers
 
 Port = Input | Output | State
 Ports = Mapping[str, Port]
