@@ -103,6 +103,9 @@ def test_blocks_of_numpys_functions_keep_the_contract(function):
     ranges = {np.arccosh: (1.1, 3.0)}.get(function, (0.1, 0.9))
     block = Function(function)
     check_block(block, **away, **({} if away else {"inputs": dict.fromkeys(block.inputs, ranges)}))
+    numbers = [np.array([1.3, 1.7, 2.1]) if function is np.arccosh else np.array([0.3, 0.7, 0.2])] * len(block.inputs)
+    run = Diagram("d", block(*numbers).named("y")).simulate(0.1, step=0.1, progress=False)
+    np.testing.assert_allclose(run["y"][-1], function(*numbers), rtol=1e-14)
 
 
 # --- units -----------------------------------------------------------------------------------------------------------
