@@ -35,6 +35,8 @@ class PlantSteps:
         self.inputs = z.copy() if moves or not self.regular else z
         """Inputs of the plants, each as of its last communication point."""
         self.reached: dict[str, int] = {}  # tick at which each plant is
+        self.ends_at_tick = True
+        """Whether plants go to the last tick of a run; else its end is before the next tick, and `end_at` takes them there."""
         self._even = {path for path in flat.plant_ticks if not takes_any_step(flat.table.blocks[path])}
         self.own = {path: part_of(flat, flat.plant_inputs, path) for path in flat.plant_ticks}
 
@@ -80,7 +82,11 @@ class PlantSteps:
         }
 
     def _goes_to(self, path: str, k: int, *, last: bool) -> bool:
-        return self._flat.steps_at(path, k) or (last and path not in self._even)
+        return self._flat.steps_at(path, k) or (last and self._stops_on_its_way(path))
+
+    def _stops_on_its_way(self, path: str) -> bool:
+        """Whether a plant steps to the last tick of a run, though it is no communication point of it."""
+        return self.ends_at_tick and path not in self._even
 
     def table(self, ticks: np.ndarray, last: int) -> StepTable | None:
         """Return the steps to ticks that are visited from here on, to the bits of `go`; None: all step at each."""
@@ -90,7 +96,7 @@ class PlantSteps:
         begins, widths, holds = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=np.uint8)
         for j, path in enumerate(self._plants):
             points = np.logical_or.reduce([pattern.among(ticks) for pattern in self._flat.plant_ticks[path]])
-            ends = points if path in self._even else points | (ticks == last)
+            ends = points | (ticks == last) if self._stops_on_its_way(path) else points
             to = ticks[ends]
             before = np.concatenate([[self.reached[path]], to[:-1]])[: len(to)]
             begins[ends, j], widths[ends, j] = times_of(self._flat, before), times_of(self._flat, to - before)
@@ -100,7 +106,8 @@ class PlantSteps:
     def arrive(self, k: int, *, last: bool) -> None:
         """Note that all plants have stepped up to tick ``k``, as `go` does to each tick that is visited."""
         for path, before in () if self.regular else self.reached.items():
-            points = k if last and path not in self._even else max(p.latest(k) for p in self._flat.plant_ticks[path])
+            stops = last and self._stops_on_its_way(path)
+            points = k if stops else max(p.latest(k) for p in self._flat.plant_ticks[path])
             self.reached[path] = max(before, points)
 
     @property

@@ -250,9 +250,18 @@ class Engine:
         self.steps.begin(first)
         self._arrive(first)
 
-    def go(self, last: int, recorder: Recorder, progress: Progress) -> None:
-        """Continue to a tick, or to where a stop condition ends the run; ``progress`` takes the time now and then."""
+    def go(self, last: int, recorder: Recorder, progress: Progress, *, ends_there: bool = True) -> None:
+        """Continue to a tick, or to where a stop condition ends the run; ``progress`` takes the time now and then.
+
+        Without ``ends_there`` the run continues to an end before the next tick: the last tick is then one at which
+        something acts, and plants wait at their last communication points for `end_between_ticks`.
+        """
         self.is_ahead, ticks = False, self._find_ticks()
+        self.steps.ends_at_tick = ends_there
+        if not (ends_there or self.every_tick):
+            last = max(clock.latest(last) for clock in self.flat.visited)
+            if last <= self.position.tick:
+                return
         if self._compile == "auto" and not self._generated:
             progress = self._change_over.watch(last, progress, ticks.make_later, self._hand_over)
         try:

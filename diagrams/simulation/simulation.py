@@ -260,7 +260,7 @@ class Simulation:
 
                 if self.stopped is None:
                     if count:
-                        self._engine.go(last, self._recorder, arrive)
+                        self._engine.go(last, self._recorder, arrive, ends_there=end is None)
                     if end is not None and self.stopped is None:
                         self._engine.end_between_ticks(end, self._recorder, arrive)
         except SimulationError as error:

@@ -118,7 +118,7 @@ class BoundRun:
             engine.take_first_tick(None, recorder)
             if engine.position.stopped is None:
                 if self.count:
-                    engine.go(self.count, recorder, progress)
+                    engine.go(self.count, recorder, progress, ends_there=self.end is None)
                 if self.end is not None and engine.position.stopped is None:
                     engine.end_between_ticks(self.end, recorder, progress)
         except SimulationError as error:

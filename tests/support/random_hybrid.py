@@ -172,10 +172,6 @@ def make(family, seed):
     elif family != "sampled" and rng.random() < 0.5:
         options["step"] = base_of(clocks, None) / pick((1, 1, 2))
     step = options["step"]
-    if (
-        family == "slower"
-    ):  # else plants stop at the last tick, too, and go on from there with the inputs that they hold
-        end = int(end / base_of(clocks, step)) * base_of(clocks, step)
     settle_plants(nodes, step, clocks)
     parts = [replace(n.part, inputs=tuple(n.sources)) for n in nodes]
     samples = visited(parts, clocks, step, end, options["every"])
@@ -292,9 +288,7 @@ def visited(parts, clocks, step, end, every):
         ticks = {k * base for k in range(int(end / base) + 1)}
     else:
         used = {c for part in parts for c in part.clocks}
-        base = base_of(clocks, None)
-        beyond = set() if (end / base).denominator == 1 else {int(end / base) * base}  # the last one before the end
-        ticks = beyond | {o + k * p for p, o in used for k in range(int((end - o) / p) + 1)}
+        ticks = {o + k * p for p, o in used for k in range(int((end - o) / p) + 1)}
     kept = sorted(ticks | {Fraction(0)})[::every]
     return kept if kept[-1] == end else [*kept, end]
 

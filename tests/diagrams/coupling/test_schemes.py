@@ -416,7 +416,7 @@ def test_states_that_were_gone_back_to_are_freed(cache, monkeypatch):
 
     counts, restore = [], FmuInstance.restore
     monkeypatch.setattr(
-        FmuInstance, "restore", lambda self, state: (counts.append(len(self.states.handles)), restore(self, state))[1]
+        FmuInstance, "restore", lambda self, state: (counts.append(len(self.states.kept)), restore(self, state))[1]
     )
     two_masses().simulate(0.2, step=0.01, progress=False, coupling=Coupling(scheme="iterated", error=1e-5))
     assert len(counts) > 100

@@ -8,6 +8,7 @@ import pytest
 from loopwright.blocks import Clock, Compare, Gain, OptionError, Sine, StopCondition, UnitDelay
 from loopwright.diagrams import Diagram, experiments, subsystem
 from support.hybrid_blocks import Falls, Lag, counting
+from support.tanks import CALLS, Tank
 
 
 @pytest.mark.parametrize("solver", ["auto", "DOP853", "BDF", "rk4"])
@@ -73,6 +74,29 @@ def test_an_fmu_steps_to_the_end():
     (p0, p1), (v0, v1) = whole["plant.position"][-2:], whole["plant.velocity"][-2:]
     middle = 0.5 * (p0 + p1) + 1e-3 / 8 * (v0 - v1)  # Hermite's cubic; the forces are held
     assert part["plant.position"][-1] == pytest.approx(middle, abs=1e-9)
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("end", [0.53, 0.58])  # the last tick of the base before it: 0.5, and 0.55, where nothing acts
+def test_a_plant_waits_for_the_end_where_the_last_tick_is_none_of_its_own(continuous, end):
+    """The level of a tank, y' = −y held over 0.15 s, which a tick of another subsystem at 0.5 s doesn't renew."""
+
+    @subsystem(sample_time=0.15)
+    def controller(level):
+        return Gain(gain=-1.0, name="gain")(level)
+
+    class Bent(Tank):
+        variable_step = True
+
+    tank = Bent(area=1.0, level=1.0, name="tank")
+    more = [Lag(name="lag")(tank.y)] if continuous else []
+    CALLS.clear()
+    run = Diagram("d", tank(u=controller(tank.y)), counting(0.1, name="c")(), *more).simulate(
+        end, progress=False, rtol=1e-10, atol=1e-12
+    )
+    assert np.allclose([*sum(CALLS[:-1], ())], [0.0, 0.15, 0.15, 0.15, 0.3, 0.15, 0.45, end - 0.45], atol=1e-15)
+    assert run.t.tolist() == [0.0, 0.1, 0.15, 0.2, 0.3, 0.4, 0.45, 0.5, end]
+    assert run["tank.y"][-3:] == pytest.approx([0.85**3, 0.85**3, 0.85**3 * (1.0 - (end - 0.45))], rel=1e-14)
 
 
 def test_a_stop_condition_before_the_end_and_at_it():
