@@ -100,8 +100,9 @@ def refuse_model_exchange(coupling: Coupling, blocks: Mapping[str, Any]) -> None
     if coupling.scheme != Scheme.ITERATED and coupling.error is None:
         return
     for path, block in blocks.items():
-        description = getattr(block, "description", None)  # that of an FMU; a user's block serializes, or says why not
-        if description is not None and not description.exchange.can_serialize:
+        # Those of an FMU; a user's block, which may have a description of another kind, serializes or says why not.
+        interface = getattr(getattr(block, "description", None), "exchange", None)
+        if interface is not None and not interface.can_serialize:
             raise OptionError(
                 f"found coupling {str(coupling)!r}, which goes back to the beginning of a step; expected a "
                 "model-exchange FMU that can turn its state into bytes (canSerializeFMUState of its description is "

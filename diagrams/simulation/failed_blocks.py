@@ -40,7 +40,7 @@ def failure(
                 for n, v in made.items()
                 if n not in instant.provisional and join(path, n) not in flat.unread
             }
-            error = _wrong(flat, here.x, path, inputs, known)
+            error = _wrong(flat, here, path, inputs, known)
             if error is not None:
                 found.append(error)
 
@@ -69,7 +69,7 @@ def opaque_failure(flat: FlatDiagram) -> SimulationError | None:
 
 
 def _wrong(
-    flat: FlatDiagram, x: np.ndarray, path: str, inputs: dict[str, Any], made: dict[str, Any]
+    flat: FlatDiagram, here: Vectors, path: str, inputs: dict[str, Any], made: dict[str, Any]
 ) -> SimulationError | None:
     trace, block = flat.checked.traced[path], flat.table.blocks[path]
     shaped = shaped_inputs(trace, inputs)
@@ -79,7 +79,7 @@ def _wrong(
                 if not value > 0:
                     u = bundle("u", shaped)
                     y = bundle("y", {n: made.get(n) for n in trace.outputs})
-                    error = block.guard_error(guard, float(value), u, y, states_of(flat, path, x))
+                    error = block.guard_error(guard, float(value), u, y, states_of(flat, path, here.x))
                     error.at(block=path)
                     return error
         elif not np.all(np.isfinite(made[name])):
@@ -87,7 +87,10 @@ def _wrong(
                 name, name
             )
             outside = block.in_model_exchange and name in block.outputs
-            hint = _out_of_an_fmu(flat, path, name) if outside else "Samples until then are in error.run."
+            step = "Samples until then are in error.run."
+            if not here.t[0] > 0.0:  # there are none
+                step = "Look at its parameters and at what is wired to it."
+            hint = _out_of_an_fmu(flat, path, name) if outside else step
             return _non_finite(path, what, made[name], f"{inputs_text(shaped)} {hint}")
     return None
 

@@ -124,6 +124,8 @@ class SubsystemTable(dict[str, SubsystemSettings], ShownAsTable):
 def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
     """Return a sample time as an exact fraction of a second: a Fraction as it is, a float as `read_time` reads it."""
     try:
+        if isinstance(value, bool):
+            raise TypeError
         time = value if isinstance(value, Fraction) else read_time(float(value))
     except (TypeError, ValueError, OverflowError):
         raise SampleTimeError(

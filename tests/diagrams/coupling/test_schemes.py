@@ -93,6 +93,7 @@ class Called(Block):
 
     in_model_exchange = True
     inner: Block = parameter(description="what is called")
+    description: str = "a text of the user's"
     inputs = property(lambda self: self.inner.inputs)
     outputs = property(lambda self: self.inner.outputs)
     states = property(lambda self: self.inner.states)

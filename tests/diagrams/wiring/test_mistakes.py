@@ -409,7 +409,13 @@ def test_a_block_that_needs_more_in_continuous_time_says_that_its_sample_time_wa
 
 @pytest.mark.parametrize(
     ("value", "words"),
-    [(0, "positive"), (-1e-3, "positive"), ("fast", "expected seconds"), (1e-10, "multiple of 1 ns")],
+    [
+        (0, "positive"),
+        (-1e-3, "positive"),
+        ("fast", "expected seconds"),
+        (True, "expected seconds"),
+        (1e-10, "multiple of 1 ns"),
+    ],
 )
 def test_a_bad_sample_time(value, words):
     with pytest.raises(SampleTimeError, match=words):
