@@ -36,7 +36,7 @@ class PlantSteps:
         """Inputs of the plants, each as of its last communication point."""
         self.reached: dict[str, int] = {}  # tick at which each plant is
         self.ends_at_tick = True
-        """Whether plants go to the last tick of a run; else its end is before the next tick, where `end_at` takes them."""
+        """Whether plants go to the last tick of a run; else its end is before the next one, and `end_at` goes there."""
         self._even = {path for path in flat.plant_ticks if not takes_any_step(flat.table.blocks[path])}
         self.own = {path: part_of(flat, flat.plant_inputs, path) for path in flat.plant_ticks}
 
