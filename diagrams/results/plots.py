@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ...blocks.core import OptionError, print_unit
+from ...blocks.core import OptionError, UnitError, convert_unit, print_unit, same_dimension
 from ..plotting import (
     COLORS,
     DARK,
@@ -50,6 +50,28 @@ class DrawnSignal:
     is_set_point: bool = False  # it comes from a source: nothing in the diagram changes it
     is_held: bool = False  # between its samples
     limits: tuple[float, ...] = ()  # that it is kept within
+
+    def in_units(self, units: Sequence[str]) -> DrawnSignal:
+        """Return the signal with each entry in its unit of these, where it has one of the same dimension."""
+        if len(units) != len(self.units) or list(units) == list(self.units):
+            return self
+        ways = [_conversion(a, b) for a, b in zip(self.units, units, strict=True)]
+        factors, offsets = np.array([way or (1.0, 0.0) for way in ways]).T
+        shape = self.values.shape[1:]
+        return replace(
+            self,
+            values=self.values * np.reshape(factors, shape) + np.reshape(offsets, shape),
+            units=[a if way is None else b for a, b, way in zip(self.units, units, ways, strict=True)],
+            limits=tuple(factors[0] * limit + offsets[0] for limit in self.limits) if len(set(ways)) == 1 else (),
+        )
+
+
+def _conversion(a: str, b: str) -> tuple[float, float] | None:
+    """Return the factor and the offset from a unit to another; None where there are none."""
+    try:
+        return convert_unit(a, b) if a and b and same_dimension(a, b) else None
+    except UnitError:  # a name that an FMU doesn't define
+        return None
 
 
 Panel = Sequence[DrawnSignal]
@@ -165,7 +187,8 @@ def _only_name(panel: Panel) -> bool:
 
 def _has_legend_of_runs(panel: Panel) -> bool:
     """Whether the curves of an axis differ in their runs alone."""
-    return _only_name(panel) and len({one.run for one in panel}) > 1 and all(one.values.ndim == 1 for one in panel)
+    alike = len({unit for one in panel for unit in one.units}) == 1 and all(one.values.ndim == 1 for one in panel)
+    return alike and _only_name(panel) and len({one.run for one in panel}) > 1
 
 
 def _has_legend(panel: Panel) -> bool:

@@ -404,7 +404,8 @@ class Run(ShownAsTable, metaclass=_RunClass):
         against : Run, measured data or mapping of str to them, optional
             What is drawn over this run, by the names that the legend has: ``{"kp = 10": other}``. Measured data are a
             pair of arrays where one signal is drawn, ``{"measured": (t, y)}``, or columns by the names of signals, in
-            a mapping of arrays or a data frame, with the times in s in ``"t"`` (or in the index of a frame).
+            a mapping of arrays or a data frame, with the times in s in ``"t"`` (or in the index of a frame). Signals
+            of other runs are drawn in the units of this one; where a unit can't be converted, the legend has it.
         label : str
             Name of this run in the legend.
         xlim : (float, float), optional
@@ -434,7 +435,11 @@ class Run(ShownAsTable, metaclass=_RunClass):
             one.check_names(names_drawn)
         if xlim is not None:
             check_argument(xlim, _TIMES, "xlim", "Run.plot")
-        panels = [[run.drawn(name, of) for of, run in runs.items() for name in group] for group in groups]
+        units = {name: self.drawn(name).units for name in names_drawn}
+        panels = [
+            [run.drawn(name, of).in_units(units[name]) for of, run in runs.items() for name in group]
+            for group in groups
+        ]
         for panel in panels:
             own = panel[: len(panel) // len(runs)]
             panel += [found for one in data for like in own if (found := one.drawn(like)) is not None]
@@ -531,8 +536,12 @@ class Run(ShownAsTable, metaclass=_RunClass):
         runs = self._runs_to_draw(against, label)
         pairs = {of: run._pair(x, y) for of, run in runs.items()}
         first, second = next(iter(pairs.values()))
-        labels = tuple(with_unit(one.name, one.units[0]) for one in (first, second))
-        curves = {of or label: (one.values, two.values) for of, (one, two) in pairs.items()}
+        drawn = {of: (one.in_units(first.units), two.in_units(second.units)) for of, (one, two) in pairs.items()}
+        labels = tuple(
+            with_unit(own.name, own.units[0] if all(pair[i].units == own.units for pair in drawn.values()) else "")
+            for i, own in enumerate((first, second))
+        )
+        curves = {of or label: (one.values, two.values) for of, (one, two) in drawn.items()}
         return plot_curve(curves, (labels[0], labels[1]), axes, is_equal=first.units == second.units)
 
     def _pair(self, x: str, y: str | None) -> tuple[DrawnSignal, DrawnSignal]:

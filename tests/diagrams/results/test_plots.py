@@ -148,3 +148,29 @@ def test_a_sweep_draws_all_its_runs():
     figure = many.plot("u")
     assert figure.axes[1].get_ylabel() == "controller.pid.kp"  # the scale of colors
     assert len({line.get_color() for line in figure.axes[0].lines}) == 7
+
+
+def test_signals_of_another_run_are_drawn_in_the_units_of_the_first():
+    """Of a plant that counts in rpm and degrees Celsius over one in rad/s and K; a newton is no speed."""
+    rates = [Ramp(slope=1.0, unit=unit, name="ramp") for unit in ("rad/s", "rpm", "N")]
+    heats = [Constant(value=300.0, unit=unit, name="heat") for unit in ("K", "degC", "K")]
+    turning, counted, pushing = (
+        Diagram("d", rate.named("a"), heat.named("b")).simulate(3.0, step=1.0, progress=False)
+        for rate, heat in zip(rates, heats, strict=True)
+    )
+    speeds, temperatures = turning.plot("a", "b", against={"counted": counted}).axes
+    np.testing.assert_allclose(speeds.lines[1].get_ydata(), np.arange(4.0) * 2.0 * np.pi / 60.0, rtol=1e-14)
+    np.testing.assert_allclose(temperatures.lines[1].get_ydata(), 573.15, rtol=1e-14)
+    assert [ax.get_ylabel() for ax in (speeds, temperatures)] == ["a [rad/s]", "b [K]"]
+
+    (ax,) = turning.plot("a", against={"pushing": pushing}).axes
+    assert [line.get_label() for line in ax.lines] == ["a [rad/s], this run", "a [N], pushing"]
+    np.testing.assert_array_equal(ax.lines[1].get_ydata(), np.arange(4.0))
+
+    (path,) = turning.plot_path("a", "b", against={"counted": counted}).axes
+    curve = next(line for line in path.lines if line.get_label() == "counted")
+    np.testing.assert_allclose(curve.get_data()[0], np.arange(4.0) * 2.0 * np.pi / 60.0, rtol=1e-14)
+    np.testing.assert_allclose(curve.get_data()[1], 573.15, rtol=1e-14)
+    assert (path.get_xlabel(), path.get_ylabel()) == ("a [rad/s]", "b [K]")
+    (path,) = turning.plot_path("a", "b", against={"pushing": pushing}).axes
+    assert (path.get_xlabel(), path.get_ylabel()) == ("a", "b [K]")
