@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -28,7 +29,7 @@ from ..compiled import (
     write_code,
 )
 from ..coupling import bind
-from ..flat import NONE, FlatDiagram, TickPattern, bits_of, flatten, has_all_kinds, kinds_of
+from ..flat import NONE, Announcer, FlatDiagram, TickPattern, bits_of, flatten, has_all_kinds, kinds_of
 from ..model_exchange import BlocksInModelExchange
 from ..simulation import (
     Continuous,
@@ -37,23 +38,35 @@ from ..simulation import (
     Workspace,
     bind_hybrid,
     bind_ticks,
+    find_late,
     find_start_values,
+    next_instant,
 )
 from ..solvers import METHODS, MethodKind
 from ..wiring import exact_time
-from .edges import find_edges
 from .exported_variables import ExportedVariables, is_sampled
-from .more_functions import trace_computed_numbers, trace_guards
 from .obstacles import refuse
 from .open_diagram import OpenDiagram
 from .plants_to_merge import loaded, merge, own_fmus
-from .slopes import trace_rates, trace_slopes
-from .start_function import trace_left, trace_start_values
+from .traced_functions import (
+    trace_computed_numbers,
+    trace_guards,
+    trace_left,
+    trace_rates,
+    trace_slopes,
+    trace_start_values,
+)
 
 _MOST_CLOCKS, _MOST_SETS = 64, 250
 _STIFF = 50.0
 """Time constants of the fastest mode in a communication step above which a diagram is stiff: an explicit method takes
 15 steps there for its stability alone."""
+_MOST_EDGES, _LISTED = 4000, 600
+"""Discontinuities that a source may have before it ends; and those of one without end, by which its period is known."""
+_PHASES = 8  # discontinuities in a period, at most
+_SAME = 1e-9  # of a period
+
+Edges = tuple[tuple[float, float], ...]
 
 
 def loop_spec(
@@ -273,3 +286,40 @@ def _start_kind(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], nam
             block=name,
         )
     return acting.index(every)
+
+
+def find_edges(opened: OpenDiagram, sources: Sequence[tuple[str, Announcer]]) -> tuple[Edges, Edges]:
+    """Return discontinuities of sources, each with the time at which it is seen there; and first ones with periods.
+
+    Raises `DefinitionError`: for a source with very many of them that don't repeat.
+    """
+    late = find_late(sources)
+    single, periodic = set[float](), list[tuple[float, float]]()
+    for path, source in sources:
+        found: list[float] = []
+        t = -1e-300  # an instant at 0 is one
+        while len(found) < _MOST_EDGES and (t := next_instant(path, source, t)) < math.inf:
+            found.append(t)
+            if len(found) == _LISTED and (repeats := _find_period(found)) is not None:
+                periodic += repeats
+                break
+        else:
+            if len(found) == _MOST_EDGES:
+                raise DefinitionError(
+                    f"it has more than {_MOST_EDGES} discontinuities, which don't repeat; so many are not exported. Put it "
+                    "into a sampled subsystem, or leave it outside: outside=….",
+                    block=path,
+                )
+            single.update(found)
+    return tuple((t, late.get(t, t)) for t in sorted(single)), tuple(periodic)
+
+
+def _find_period(times: list[float]) -> list[tuple[float, float]] | None:
+    """Return the first discontinuities with their period; None if they don't repeat from the first one on."""
+    for phases in range(1, _PHASES + 1):
+        whole = (len(times) - 1) // phases
+        period = (times[whole * phases] - times[0]) / whole
+        expected = (times[i % phases] + (i // phases) * period for i in range(len(times)))
+        if all(abs(a - b) <= _SAME * period for a, b in zip(times, expected, strict=True)):
+            return [(times[i], period) for i in range(phases)]
+    return None

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import ParameterError, UnknownNameError, near
-from ..flat import Target, WiredDiagram, with_movable
+from ...blocks.core import Block, Output, ParameterError, UnknownNameError, near, parameter
+from ..flat import FlatDiagram, Target, WiredDiagram, with_movable
+from ..simulation import RunOptions, Simulation
 from ..wiring import Collector, Structure, Subsystem, Wire, find_path, join, split_entry
-from .outside import Outside
-from .start import DiagramStart, find_start
 
 _OUTSIDE = "outside"
+_STEP = 1e-3  # s, of a diagram without any; its start has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +190,7 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
     moved: dict[tuple[str, str], str] = {}
     read: dict[str, Wire] = {}
     paths = [find_path(given, table.blocks, "block", wired.name) for given in outside]
-    start = find_start(wired) if paths else DiagramStart.none()
+    start = find_start(wired) if paths else _DiagramStart.none()
 
     def label(path: str, port: str, taken: Collection[str], *, alone: bool) -> str:
         """Return the name of a port: its own, or where that is taken with its block's in front."""
@@ -317,3 +317,56 @@ def choose_outputs(opened: OpenDiagram, outputs: tuple[str, ...] | None) -> Open
     for name in outputs:
         chosen[name] = known[find_path(name, known, "signal", wired.name)]
     return replace(opened, outputs=chosen)
+
+
+class Outside(Block):
+    """Whatever is around a diagram that is exported: nothing steps it, its outputs are set from outside."""
+
+    stepped = True
+    ports: Any = parameter(kw_only=False, description="inputs of the diagram: name, shape, unit, start value, ...")
+
+    @property
+    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
+        """The inputs of the diagram."""
+        return {
+            name: Output(shape=shape, unit=unit, description=description, name=name)
+            for name, shape, unit, description, _ in self.ports
+        }
+
+    def start_of(self, name: str) -> np.ndarray:
+        """Return the start value of an input, flat."""
+        shape, start = next((shape, start) for key, shape, _, _, start in self.ports if key == name)
+        return np.ravel(np.broadcast_to(np.asarray(start, dtype=float), shape))
+
+
+@dataclass(frozen=True, eq=False)
+class _DiagramStart:
+    """Signals and states of a diagram at t = 0."""
+
+    flat: FlatDiagram | None
+    log: np.ndarray
+    states: Mapping[str, np.ndarray]
+
+    @classmethod
+    def none(cls) -> _DiagramStart:
+        """Return the start of which nothing is asked."""
+        return cls(None, np.zeros(0), {})
+
+    def signal(self, path: str, port: str) -> np.ndarray:
+        """Return an output of a block."""
+        assert self.flat is not None
+        full = join(path, port)
+        return np.array(self.log[self.flat.log.slices[full]].reshape(self.flat.log.shapes[full]))
+
+
+def find_start(wired: WiredDiagram) -> _DiagramStart:
+    """Begin a run of a diagram, and return its start.
+
+    Raises `LoopwrightError`: as a run does.
+    """
+    with Simulation(wired, RunOptions(step=None if wired.has_base else _STEP)) as simulation:
+        flat, view = simulation.flat, simulation.view
+        log, x = view.log.copy(), view.x.copy()
+    # blocks that delays and units have become are other ones in a part, and start from their inputs
+    own = {path: x[where] for path, where in flat.states.slices.items() if path in wired.structure.blocks}
+    return _DiagramStart(flat, log, own)

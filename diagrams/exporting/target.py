@@ -29,9 +29,9 @@ from ..flat import FlatDiagram, TickPattern, bits_of, kinds_of, share_terms, spe
 from ..wiring import join
 from .loop_of_diagram import loop_spec
 from .make_exported import open_model
-from .more_functions import trace_computed_numbers
 from .obstacles import find_continuous, refuse, refuse_between_ticks, refuse_fmus
 from .open_diagram import OpenDiagram
+from .traced_functions import trace_computed_numbers
 
 _LARGEST = 20_000
 """Operations of a tick that are written as text; a compiler takes long for more."""

@@ -2,8 +2,8 @@
 
 from .lane_code import LaneCode, compile_lanes
 from .lane_runs import LaneEnd, LaneRuns, LaneStart, LaneVectors, make_room
-from .no_lanes import NoLanesError
 from .start_code import StartSource
+from .vector_code import NoLanesError
 
 __all__ = [
     "LaneCode",

@@ -9,8 +9,7 @@ from typing import Any
 
 from ...blocks.core import left_of
 from ..solvers import METHODS
-from .methods import write_methods
-from .scalar_calls import ScalarFunctions
+from .vector_code import ScalarFunctions, write_methods
 
 _RATES = Template("""
 typedef struct { const vec *x, *w, *p, *kept; } states;

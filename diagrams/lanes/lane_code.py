@@ -18,9 +18,8 @@ from .flow_code import FlowSource, write_flow
 from .lane_loops import LoopSource, write_loops
 from .lane_plants import LanePlant, read_plant
 from .lane_ticks import TickSources, read_source
-from .no_lanes import NoLanesError
-from .scalar_calls import ScalarFunctions
 from .start_code import StartSource, write_start
+from .vector_code import NoLanesError, ScalarFunctions
 
 # A product and a sum of one expression are fused, whatever the optimizer does; more of it gains nothing.
 FLAGS = ("-O2", "-ffp-contract=on")

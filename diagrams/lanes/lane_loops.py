@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 
 from ..compiled import NewtonOptions
-from .scalar_calls import ScalarFunctions
+from .vector_code import ScalarFunctions
 
 _TEXT = Template("""
 /* Solve the loops of a tick from the values in x on, where a run is alive; return where they are not solved. */

@@ -15,9 +15,7 @@ from ...fmus import Fmu
 from ...fmus.archive import FmuVariable
 from ...fmus.calls import FmuInstance
 from ...fmus.export import WrittenEquations, read_equations
-from .methods import write_methods
-from .no_lanes import NoLanesError
-from .vector_code import write_vectors
+from .vector_code import NoLanesError, write_methods, write_vectors
 
 _ARGUMENTS = ("t", "x", "u", "p")
 _SETTINGS = ("internal_step", "integrator", "tolerance")

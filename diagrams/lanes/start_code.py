@@ -11,7 +11,7 @@ import casadi as ca
 from ..flat import TickPattern
 from .lane_plants import LanePlant
 from .lane_ticks import TickSources
-from .scalar_calls import ScalarFunctions
+from .vector_code import ScalarFunctions
 
 _START = ("x", "w", "p", "left")
 _FIRST_TICK = """

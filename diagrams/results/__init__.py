@@ -1,16 +1,13 @@
 """Results of runs: recording, storage, plots and exports."""
 
-from .memory import machine_memory
 from .operating_point import FreeDirection, OperatingPoint, PointOrigin, units_of
 from .recorded_signals import RecordedSignals
 from .recorded_texts import TextSignal
-from .recorder import Recorder
-from .recording import Recording
+from .recorder import Recorder, Recording, machine_memory
 from .run import Run, Snapshot
 from .saved_state import RunState, check_fits, layout_of, not_open_error
 from .signal_names import resolve
-from .step_info import StepInfo
-from .step_measures import ExpectedStep, is_at_rest, measure_step
+from .step_info import ExpectedStep, StepInfo, is_at_rest, measure_step
 from .stored import SWEEP_HEADER, Occurrence, Stopped
 
 __all__ = [

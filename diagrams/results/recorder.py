@@ -1,9 +1,13 @@
-"""The recorder: takes samples into memory, or to disk during the run."""
+"""The recorder: takes samples into memory, or to disk during the run; the choices of a recording, and its room."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
 from io import FileIO
 from pathlib import Path
 from time import monotonic
@@ -11,9 +15,20 @@ from typing import TextIO
 
 import numpy as np
 
-from ...blocks.core import SimulationError, check_argument, describe_disk_error, enumerate_some, kinds
-from .memory import machine_memory
-from .stored import END, OTHER_PATH, Occurrence, PathLike, create, event_line, prepare, read, split, write_json
+from ...blocks.core import (
+    Block,
+    OptionError,
+    SimulationError,
+    accepts,
+    check_argument,
+    describe_disk_error,
+    enumerate_some,
+    explain_disk_errors,
+    kinds,
+)
+from ..flat import FlatDiagram
+from .recorded_signals import RecordedSignals
+from .stored import END, OTHER_PATH, Occurrence, PathLike, create, event_line, header, prepare, read, split, write_json
 
 _FIRST, _LARGEST = 1024, 2**26  # rows of the first chunk in memory, bytes of the largest
 _ROWS, _BYTES = 1024, 2**18  # of a chunk on its way to disk, whichever is less
@@ -291,3 +306,106 @@ class Recorder:
         stored = read(self.to)
         self.events, self.residual = stored.events, stored.residual
         return stored.t, stored.data
+
+
+@accepts(None, every=EVERY)
+@dataclass
+class Recording:
+    """The choices of a recording: `Diagram.simulate` takes them as ``record``, ``every``, ``states`` and ``to``."""
+
+    flat: FlatDiagram
+    name: str
+    blocks: Mapping[str, Block]
+    """The diagram's blocks, as they were wired."""
+    record: Iterable[str] | None
+    every: int
+    states: bool
+    to: PathLike | None
+    overwrite: bool
+
+    def __post_init__(self) -> None:
+        if self.record is not None and not isinstance(self.record, Iterable):
+            raise OptionError(
+                f"found record={self.record!r}; expected names of signals, such as record=['y'].", block=self.name
+            )
+        if self.to is not None and not isinstance(self.to, str | os.PathLike):
+            raise OptionError(f"found to={self.to!r}; expected the path of a folder.", block=self.name)
+
+    def stay_in_memory(self) -> None:
+        """Let the next recorder keep its samples in memory: the run on disk stays."""
+        self.to = None
+
+    def allow_overwriting(self) -> None:
+        """Let the next recorder replace the run on disk."""
+        self.overwrite = True
+
+    @cached_property
+    def signals(self) -> RecordedSignals:
+        """The signals that are recorded."""
+        return RecordedSignals.of(self.flat, self.blocks).choose(self.record, states=self.states)
+
+    def check_memory(self, ticks: int, *, every_tick: bool) -> None:
+        """Refuse a run whose samples can't fit: at every tick, or at those at which a subsystem acts."""
+        columns = self.signals.columns
+        width = self.signals.width if columns is None else len(columns)
+        clocks = self.flat.distinct
+        samples = ticks + 1
+        if clocks and not every_tick:
+            samples = min(samples, sum(ticks // clock.every + 1 for clock in clocks) + 2)
+        check_memory(samples, width, self.flat.base, self.name, every=self.every, to=self.to)
+
+    def begin(self, rows: int | None = None) -> Recorder:
+        """Return a recorder that has no sample yet; ``rows`` are the samples to come, if that is known."""
+        residual = bool(self.flat.loops.slices)
+        recorder = Recorder(
+            self.signals.width,
+            self.signals.columns,
+            every=self.every,
+            rows=rows,
+            residual=residual,
+            to=self.to,
+            header=None if self.to is None else header(self.name, self.signals, residual=residual),
+            overwrite=self.overwrite,
+        )
+        recorder.watch(self.flat.unread)
+        return recorder
+
+
+def machine_memory() -> int:
+    """Return the bytes of memory of this machine."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):  # not on Windows
+        return 16 * 2**30
+
+
+def check_memory(
+    samples: int, width: int, base: Fraction, name: str, *, every: int = 1, to: str | os.PathLike[str] | None = None
+) -> None:
+    """Refuse a run whose samples can't fit, before it takes the machine down.
+
+    There is one sample more than ticks of ``base`` seconds; ``width`` numbers of one sample in ``every`` are recorded,
+    in memory, or on disk at ``to``.
+    """
+    needed = -(-samples // every) * 8 * (width + 1)
+    if to is None:
+        there, most, place = machine_memory(), 0.8 * machine_memory(), "this machine has"
+        remedy = "record less with record=[…] or every=…, or stream to disk with to=path"
+    else:
+        there = most = free_on_disk(Path(to))
+        place, remedy = "the disk has free", "record less with record=[…] or every=…, or choose another disk"
+    if needed > most:
+        kept = f"{width} numbers each" if every == 1 else f"{width} numbers of each {every}th"
+        raise OptionError(
+            f"found {samples - 1} ticks of {float(base):g} s; {kept} need {needed / 2**30:.0f} GiB, "
+            f"and {place} {there / 2**30:.0f}. Is the duration in s? Take a shorter one or a larger step, {remedy}.",
+            block=name,
+            port="duration",
+        )
+
+
+def free_on_disk(path: Path) -> int:
+    """Return the bytes that are free where a path is to be created."""
+    with explain_disk_errors(f"the run can't be kept in {str(path)!r}", path, "Choose another path.", OptionError):
+        path = path.absolute()
+        return shutil.disk_usage(next(p for p in (path, *path.parents) if p.exists())).free

@@ -26,7 +26,6 @@ from ...blocks.core import (
     with_unit,
 )
 from ..wiring import Wire, index_of, split_entry
-from .measured_signals import Data, MeasuredSignals, split_measured
 from .recorded_signals import RecordedSignals
 from .recorded_texts import TextSignal
 from .signal_names import resolve
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from xarray import Dataset
 
-    from .plots import DrawnSignal
+    from .plots import Data, DrawnSignal, MeasuredSignals
     from .saved_state import RunState
     from .step_info import StepInfo
 
@@ -425,7 +424,7 @@ class Run(ShownAsTable, metaclass=_RunClass):
         OptionError
             For something else than names, runs and measured data, and times that are no range.
         """
-        from .plots import plot_signals
+        from .plots import plot_signals, split_measured
 
         groups = self._groups_to_draw(names)
         others, data = split_measured(against)

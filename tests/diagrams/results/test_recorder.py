@@ -13,11 +13,9 @@ import pytest
 
 from loopwright.blocks import OptionError, SimulationError, UnknownNameError
 from loopwright.diagrams import Run
-from loopwright.diagrams.results import memory as _memory
 from loopwright.diagrams.results import recorder as _recorder
-from loopwright.diagrams.results.memory import check_memory
 from loopwright.diagrams.results.recorded_signals import RecordedSignals
-from loopwright.diagrams.results.recorder import Recorder
+from loopwright.diagrams.results.recorder import Recorder, check_memory
 from loopwright.diagrams.results.stored import header
 from loopwright.types import Layout, Occurrence, Stopped, Wire
 
@@ -339,7 +337,7 @@ def test_a_selection_refuses_a_name_that_is_not_there():
 
 
 def test_memory_is_checked_against_what_is_really_recorded(monkeypatch):
-    monkeypatch.setattr(_memory, "machine_memory", lambda: 10**9)
+    monkeypatch.setattr(_recorder, "machine_memory", lambda: 10**9)
     tick = Fraction(1, 1000)
     with pytest.raises(
         OptionError, match=r"^d\.duration: found 999999 ticks of 0\.001 s; 100 numbers each need .*record=.*every=.*to="
@@ -352,8 +350,8 @@ def test_memory_is_checked_against_what_is_really_recorded(monkeypatch):
 
 
 def test_a_run_to_disk_is_checked_against_what_is_free_there(monkeypatch, tmp_path):
-    monkeypatch.setattr(_memory, "machine_memory", lambda: 1)
-    monkeypatch.setattr(_memory, "free_on_disk", lambda path: 10**9)
+    monkeypatch.setattr(_recorder, "machine_memory", lambda: 1)
+    monkeypatch.setattr(_recorder, "free_on_disk", lambda path: 10**9)
     tick = Fraction(1, 1000)
     check_memory(10**6, 100, tick, "d", to=tmp_path / "run")
     with pytest.raises(OptionError, match="the disk has free .*choose another disk"):
@@ -361,7 +359,7 @@ def test_a_run_to_disk_is_checked_against_what_is_free_there(monkeypatch, tmp_pa
 
 
 def test_free_space_is_that_of_the_nearest_folder_that_exists(tmp_path):
-    assert _memory.free_on_disk(tmp_path / "a" / "b") == pytest.approx(_memory.free_on_disk(tmp_path), rel=0.1)
+    assert _recorder.free_on_disk(tmp_path / "a" / "b") == pytest.approx(_recorder.free_on_disk(tmp_path), rel=0.1)
 
 
 @pytest.mark.parametrize("columns", [None, range(1, 20_000, 2)], ids=["all", "some"])
