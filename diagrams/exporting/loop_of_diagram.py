@@ -306,8 +306,8 @@ def find_edges(opened: OpenDiagram, sources: Sequence[tuple[str, Announcer]]) ->
         else:
             if len(found) == _MOST_EDGES:
                 raise DefinitionError(
-                    f"it has more than {_MOST_EDGES} discontinuities, which don't repeat; so many are not exported. Put "
-                    "it into a sampled subsystem, or leave it outside: outside=….",
+                    f"it has more than {_MOST_EDGES} discontinuities, which don't repeat; so many are not exported. "
+                    "Put it into a sampled subsystem, or leave it outside: outside=….",
                     block=path,
                 )
             single.update(found)

@@ -1,9 +1,8 @@
 """Requirements on a design, and the verdicts on its numbers."""
 
 from .contact_limits import ContactLimits, read_contact_limits
-from .explanations import explain
 from .requirements import REQUIREMENTS, Requirements, StepLimits, write_requirements
-from .results import RequirementResult, StepSize
+from .results import RequirementResult, StepSize, explain
 from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
 from .verdict_table import COLUMNS, DIGITS, MOST_REQUIREMENTS, NOTHING, Review, by_loop, rank, reason_in_table, row_of
 from .verdicts import SENSES, STEP_UNITS, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval

@@ -9,8 +9,7 @@ from typing import Any
 
 from ...blocks.core import Grid, Sheet, ShownAsTable, brief, explain_calls
 from ..frequency import Number
-from .explanations import CONTACT, explain
-from .results import RequirementResult
+from .results import CONTACT, RequirementResult, explain
 from .verdicts import Verdict
 
 COLUMNS = ("verdict", "requirement", "at", "variant", "required", "found", "distance")

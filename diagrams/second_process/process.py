@@ -1,4 +1,7 @@
-"""The side of the first process: parts of a result are shared out as both processes get to them."""
+"""A second process and the side of the first: parts of a result are shared out as both processes get to them.
+
+The second process is sent a function and keys (`main`), and answers with parts of the result.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,15 @@ from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Generic, TypeVar
 
-from ...blocks.core import LoopwrightError
-from ...fmus.child_processes import ProcessGroup, PythonChild
+from ...blocks.core import LoopwrightError, on_one_thread
+from ...fmus.child_processes import Host, ProcessGroup, PythonChild
 from ..sweeps import to_bytes
-from .child import Make
 
 T = TypeVar("T")
 PAUSE = 0.1
 """Seconds between two looks at what the second process reports, while this one waits for it."""
+Make = Callable[[str, Callable[[str], None]], object]
+"""``make(key, notify)``: return the part of a key, the same in any process; ``notify`` gets texts on progress."""
 
 
 class SecondProcess(Generic[T]):
@@ -37,7 +41,7 @@ class SecondProcess(Generic[T]):
             data = to_bytes(make, name)
             self._group = ProcessGroup()
             try:
-                self._child = PythonChild(self._group, "loopwright.diagrams.second_process.child")
+                self._child = PythonChild(self._group, "loopwright.diagrams.second_process.process")
             except BaseException:
                 self._group.end()
                 raise
@@ -102,3 +106,23 @@ class SecondProcess(Generic[T]):
                     kind, answer = child.receive()
                 if kind == "made":
                     self._made[key] = answer
+
+
+@on_one_thread
+def main() -> None:
+    """Answer keys with parts until the host ends: ``("progress", text)``, then ``("made", bytes)``."""
+    with suppress(EOFError, BrokenPipeError):
+        host = Host()
+        data = host.receive()
+        make: Make | None = None
+        while True:
+            key = host.receive()
+            try:
+                make = pickle.loads(data) if make is None else make
+                made = pickle.dumps(make(key, lambda text: host.send(("progress", text))), protocol=5)
+            except BrokenPipeError:
+                return
+            except Exception:  # it fails, or can't be sent: the first process makes it, and raises its error
+                host.send(("failed", None))
+            else:
+                host.send(("made", made))

@@ -1,8 +1,12 @@
-"""Descriptions of an SSP, read into the classes of `elements`: systems within systems, and over several files."""
+"""Descriptions of an SSP, read into the classes of `elements`: systems within systems, and over several files.
+
+First systems and components, then their connectors, connections and signal dictionaries, then parameter bindings with
+their sets and mappings.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,11 +14,23 @@ from urllib.parse import unquote
 
 from ...blocks.core import SspFileError, near
 from ...fmus.archive import ArchiveLimits, FmuFault
-from .connectors import read_connection, read_connectors, read_dictionary
-from .elements import Component, Connector, DictionaryReference, Element, ProposedExperiment, System
-from .parameter_files import read_bindings
+from .elements import (
+    INTEGERS,
+    REALS,
+    Binding,
+    Component,
+    Connection,
+    Connector,
+    DictionaryReference,
+    Element,
+    MappingEntry,
+    ParameterValue,
+    ProposedExperiment,
+    System,
+    Transformation,
+)
 from .ssp_files import DEFAULT, Package, PackagedFile, open_package
-from .xml_file import FULL_NAMESPACE, XmlFile, tag_of
+from .xml_file import FULL_NAMESPACE, XmlFile, flag, tag_of
 
 FMU, PACKAGE, DEFINITION = (
     "application/x-fmu-sharedlibrary",
@@ -25,6 +41,11 @@ _DEEPEST = 16
 """Packages and systems within one another that are opened."""
 _MOST_ELEMENTS = 10_000
 """Elements of a diagram, of all nested files together."""
+_KINDS = ("input", "output", "inout", "parameter", "calculatedParameter", "structuralParameter", "constant", "local")
+TYPES = {*REALS, *INTEGERS, "Boolean", "String", "Enumeration", "Binary"}
+"""Elements that are the type of a connector or a parameter."""
+_MAPPED = {"BooleanMappingTransformation": "boolean", "IntegerMappingTransformation": "integer"}
+_MAPPED["EnumerationMappingTransformation"] = "enumeration"
 
 
 @dataclass(frozen=True)
@@ -134,11 +155,11 @@ class _SspReader:
         )
         return System(
             element.get("name", ""),
-            read_connectors(file, element, at),
-            read_bindings(file, element, at, None),
+            _read_connectors(file, element, at),
+            _read_bindings(file, element, at, None),
             elements=self._elements(file, element, at),
             connections=tuple(
-                read_connection(file, child, at) for child in file.members("Connections", element, "Connection", at=at)
+                _read_connection(file, child, at) for child in file.members("Connections", element, "Connection", at=at)
             ),
             dictionaries=_read_dictionaries(file, element, at),
         )
@@ -161,7 +182,7 @@ class _SspReader:
                 found[name] = self.system(file, child, path)
             else:
                 found[name] = DictionaryReference(
-                    name, read_connectors(file, child, path), (), dictionary=child.get("dictionary", "")
+                    name, _read_connectors(file, child, path), (), dictionary=child.get("dictionary", "")
                 )
         return found
 
@@ -169,7 +190,7 @@ class _SspReader:
         """Return a component, or the system of the file that it refers to."""
         file.expect_children(element, "Connectors", "ParameterBindings", at=at)
         source, name = element.get("source"), file.name_of(element, at)
-        connectors = read_connectors(file, element, at)
+        connectors = _read_connectors(file, element, at)
         if source is None:
             raise file.error(
                 "found a component without a source, a place for an implementation; expected an FMU. Add its source.",
@@ -185,7 +206,7 @@ class _SspReader:
             )
         if kind == FMU:
             place = file.place.resolve(path, at)
-            bindings = read_bindings(file, element, at, place)
+            bindings = _read_bindings(file, element, at, place)
             implementation = element.get("implementation") or "any"
             return Component(
                 name,
@@ -203,7 +224,7 @@ class _SspReader:
                 f"its own. {near(missing[0], inner.connectors)}",
                 at,
             )
-        bindings = read_bindings(file, element, at, file.place.resolve(path, at) if path else None)
+        bindings = _read_bindings(file, element, at, file.place.resolve(path, at) if path else None)
         return replace(inner, name=name, bindings=(*inner.bindings, *bindings))
 
     def _other_system(self, file: XmlFile, path: str, fragment: str, kind: str, at: str) -> System:
@@ -234,7 +255,7 @@ def _read_dictionaries(file: XmlFile, element: Any, at: str) -> dict[str, Mappin
         file.expect_type(child, "application/x-ssp-signal-dictionary", at)
         name = file.name_of(child, at)
         part = file.part(child, "SignalDictionary", child, at, None)
-        found[name] = {} if part is None else read_dictionary(part, f"{at or 'the root system'}.{name}")
+        found[name] = {} if part is None else _read_dictionary(part, f"{at or 'the root system'}.{name}")
     return found
 
 
@@ -262,3 +283,129 @@ def _is_positive(text: str) -> bool:
         return float(text) > 0.0
     except ValueError:
         return False
+
+
+def _read_connector(file: XmlFile, element: Any, at: str) -> Connector:
+    """Return a connector, or an entry of a signal dictionary."""
+    name = file.name_of(element, at)
+    where = ".".join(filter(None, (at, name)))
+    kind = element.get("kind", "unspecified")
+    if kind not in (*_KINDS, "unspecified", "acausal"):
+        raise file.error(f"found the kind {kind!r}; expected one of {', '.join(_KINDS)}. Export it again.", where)
+    type_, unit, items = "", None, dict[str, int]()
+    for child in file.children(element):
+        tag = file.expect(child, *TYPES, "Dimension", at=where)
+        if tag == "Dimension":
+            continue
+        type_, unit = tag, file.find_unit(child.get("unit"))
+        if tag == "Enumeration":
+            items = file.enumerations.get(child.get("name", ""), {})
+    return Connector(name, "unspecified" if kind == "acausal" else kind, type_, unit, file.shape(element, where), items)
+
+
+def _read_connectors(file: XmlFile, element: Any, at: str) -> dict[str, Connector]:
+    """Return the connectors of an element by name."""
+    found: dict[str, Connector] = {}
+    for child in file.members("Connectors", element, "Connector", at=at):
+        made = _read_connector(file, child, at)
+        if made.name in found:
+            raise file.error(f"found two connectors {made.name!r}; expected one. Rename one.", at)
+        found[made.name] = made
+    return found
+
+
+def _read_transformation(file: XmlFile, element: Any, at: str) -> Transformation | None:
+    """Return the transformation of a connection or of a mapping entry, if there is one."""
+    for child in file.children(element):
+        tag = file.expect(child, "LinearTransformation", *_MAPPED, at=at)
+        if tag == "LinearTransformation":
+            return Transformation(file.number(child, "factor", 1.0, at), file.number(child, "offset", 0.0, at))
+        table = [(str(entry.get("source")), str(entry.get("target"))) for entry in file.children(child)]
+        if len({source for source, _ in table}) < len(table):
+            raise file.error(f"found two entries of one source in {tag}; expected one. Leave one out.", at)
+        return Transformation(kind=_MAPPED[tag], table=tuple(table))
+    return None
+
+
+def _read_connection(file: XmlFile, element: Any, at: str) -> Connection:
+    """Return a connection."""
+    for side in ("start", "end"):
+        if not element.get(f"{side}Connector"):
+            raise file.error(f"found a connection without {side}Connector; expected one. Export it again.", at)
+        if element.get(f"{side}Indices") is not None:
+            raise file.error(
+                f"found {side}Indices={element.get(f'{side}Indices')!r} at a connection, which is not supported "
+                "here; expected connections of whole connectors. Connect the array, or export scalars.",
+                at,
+            )
+    start, end = ((element.get(f"{side}Element") or "", element.get(f"{side}Connector")) for side in ("start", "end"))
+    return Connection(start, end, _read_transformation(file, element, at), flag(element, "suppressUnitConversion"))
+
+
+def _read_dictionary(file: XmlFile, at: str) -> dict[str, Connector]:
+    """Return the entries of a signal dictionary by name."""
+    found: dict[str, Connector] = {}
+    for element in file.children(file.root):
+        if file.expect(element, "DictionaryEntry", "Enumerations", "Units", at=at) == "DictionaryEntry":
+            entry = _read_connector(file, element, at)
+            found[entry.name] = replace(entry, kind="inout")
+    return found
+
+
+def _read_bindings(file: XmlFile, element: Any, at: str, component: PackagedFile | None) -> tuple[Binding, ...]:
+    """Return the parameter bindings of an element, in their order."""
+    found = file.members("ParameterBindings", element, "ParameterBinding", at=at)
+    return tuple(_read_binding(file, child, at, component) for child in found)
+
+
+def _read_binding(file: XmlFile, element: Any, at: str, component: PackagedFile | None) -> Binding:
+    file.expect_children(element, "ParameterValues", "ParameterMapping", at=at)
+    kind = "application/x-ssp-parameter-set"
+    file.expect_type(element, kind, at)
+    values = file.part(element, "ParameterValues", file.one("ParameterValues", element), at, component)
+    if values is None:
+        raise file.error(
+            "found a parameter binding with neither a source nor ParameterValues; expected one of them. Export it "
+            "again.",
+            at,
+        )
+    mapping, inline = None, file.one("ParameterMapping", element)
+    if inline is not None:
+        file.expect_type(inline, "application/x-ssp-parameter-mapping", at)
+        found = file.part(inline, "ParameterMapping", inline, at, component)
+        mapping = () if found is None else tuple(_read_mapping(found, at))
+    return Binding(tuple(_read_values(values, at)), mapping, element.get("prefix") or "")
+
+
+def _read_values(file: XmlFile, at: str) -> Iterator[ParameterValue]:
+    """Yield the values of a parameter set."""
+    file.expect_children(file.root, "Parameters", "Enumerations", "Units", at=at)
+    for element in file.members("Parameters", file.root, "Parameter"):
+        name = file.name_of(element, at)
+        found = [child for child in file.children(element) if tag_of(child) != "Dimension"]
+        if len(found) != 1:
+            raise file.error(f"found {len(found)} values of {name!r}; expected one. Export it again.", at)
+        tag = file.expect(found[0], *TYPES, at=at)
+        text = found[0].get("value")
+        if text is None:
+            raise file.error(f"found the parameter {name!r} without a value; expected one. Export it again.", at)
+        unit, items = file.find_unit(found[0].get("unit")), file.enumerations.get(found[0].get("name", ""), {})
+        yield ParameterValue(name, tag, text, unit, file.shape(element, at), items)
+
+
+def _read_mapping(file: XmlFile, at: str) -> Iterator[MappingEntry]:
+    """Yield the entries of a parameter mapping."""
+    targets: set[str] = set()
+    for element in file.children(file.root):
+        file.expect(element, "MappingEntry", at=at)
+        source, target = element.get("source"), element.get("target")
+        if source is None or not target:
+            raise file.error("found a mapping entry without source or target; expected both. Add it.", at)
+        if not source:  # a template that was not filled in
+            continue
+        if target in targets:
+            raise file.error(f"found two mapping entries of the target {target!r}; expected one. Leave one out.", at)
+        targets.add(target)
+        yield MappingEntry(
+            source, target, _read_transformation(file, element, at), flag(element, "suppressUnitConversion")
+        )

@@ -21,13 +21,13 @@ from .documents import (
     WrittenConnector,
     WrittenElement,
     WrittenValue,
+    lay_out,
     needs_version_2,
     write_description,
     write_dictionary,
     write_values,
 )
 from .exported_parts import Export, build_export, find_export, order_sampled, split_diagram
-from .geometry import lay_out
 from .ssp_files import DEFAULT
 from .terms import Term, Terms
 

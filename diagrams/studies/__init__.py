@@ -2,10 +2,16 @@
 
 from .cases import CaseOrigin, CaseState, StudyCase
 from .confirmed_cases import ConfirmationKind, RunConfirmation
-from .confirmed_sensitivity import confirm_parameter, confirm_sensitivity
 from .contact_task import ContactTask
 from .loop_places import LoopPlace, cut_places, find_places, is_zero, words_of
-from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
+from .sensitivity import (
+    Sensitivities,
+    Sensitivity,
+    confirm_parameter,
+    confirm_sensitivity,
+    find_sensitivities,
+    sensitivities_of,
+)
 from .worst_case import WorstCase, find_worst_case
 from .worst_case_plot import plot_cases
 from .worst_case_task import WorstCaseTask

@@ -32,8 +32,7 @@ from .confirmed_cases import RunConfirmation, confirm_case
 from .loop_places import OtherCuts, place_loops
 from .measures import ContactMeasure, FunctionMeasure, Measure
 from .numbers import write_open_loop
-from .ranges import check_ranges, read_boxes
-from .varied_parameters import check_parameters
+from .varied_parameters import check_parameters, check_ranges, read_boxes
 from .worst_case_plot import plot_cases
 from .worst_case_search import Study
 

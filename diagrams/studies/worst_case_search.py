@@ -27,7 +27,7 @@ from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe
 from .loop_places import OtherCuts, numbers_at_other_cuts
 from .measures import Measure
 from .numbers import numbers_of
-from .ranges import Ranges
+from .varied_parameters import Ranges
 
 if TYPE_CHECKING:
     from control import StateSpace

@@ -16,8 +16,7 @@ from ..sweeps import Box, read_samples
 from .cases import Goal, make_goal
 from .loop_places import STEP
 from .measures import ContactMeasure
-from .ranges import check_ranges
-from .varied_parameters import check_parameters
+from .varied_parameters import check_parameters, check_ranges
 from .worst_case import WorstCase, find_worst_case
 
 TABLE = "worst_case"

@@ -15,8 +15,7 @@ import numpy as np
 from ...blocks.core import OptionError, explain_disk_errors, replace_file, write_text
 from ..results import SWEEP_HEADER
 from .outcome import WORKER_ENDED, Failure, SampleOutcome
-from .revision import Parts, digest_of
-from .sweep_differences import describe_differences
+from .revision import Parts, describe_differences, digest_of
 
 HEAD = SWEEP_HEADER
 _FORMAT = 2

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 from .outcome import SampleOutcome
 from .plan import Plan
 from .processes import run_in_processes
+from .sample_queue import SampleQueue
 from .samples import Sample
-from .threads import run_in_threads
+from .worker import Worker
 from .workers import make_worker
 
 _ASKED = 4
@@ -34,8 +36,36 @@ def run_samples(
                 yield from worker.run_all(samples[k : k + worker.width])
             return
         if any(worker.can_compile(sample) for sample in samples[:_ASKED]):
-            with closing(run_in_threads(plan, samples, min(workers, len(samples)), worker)) as stream:
+            with closing(_run_in_threads(plan, samples, min(workers, len(samples)), worker)) as stream:
                 yield from stream
             return
     with closing(run_in_processes(plan, samples, min(workers, len(samples)))) as stream:
         yield from stream
+
+
+class _Halt(BaseException):
+    """Ends the run of a thread whose sweep is over."""
+
+
+def _run_in_threads(
+    plan: Plan, samples: Iterable[Sample], count: int, worker: Worker
+) -> Generator[SampleOutcome, None, None]:
+    """Yield the outcomes of samples, in the order in which they are ready; ``worker``, the first thread's, is set up.
+
+    Where the caller stops, such as after Ctrl-C, the runs at hand end within a chunk of ticks.
+    """
+
+    def work(worker: Worker, queue: SampleQueue) -> None:
+        def progress(t: float) -> None:
+            if queue.is_closed:
+                raise _Halt
+
+        while taken := queue.take(worker.width):
+            for outcome in worker.run_all(taken, progress):
+                queue.put(outcome)
+
+    def make_and_work(queue: SampleQueue) -> None:
+        with make_worker(plan) as own:
+            work(own, queue)
+
+    yield from SampleQueue(samples).serve([partial(work, worker), *[make_and_work] * (count - 1)])

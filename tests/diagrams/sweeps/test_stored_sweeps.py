@@ -11,7 +11,7 @@ import pytest
 from loopwright.blocks import Block, Input, OptionError, Output, Ramp, Step, parameter
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.sweeps import InterruptedSweep, final, maximum, store
-from loopwright.diagrams.sweeps.sweep_differences import describe_differences
+from loopwright.diagrams.sweeps.revision import describe_differences
 from loopwright.diagrams.sweeps.worker import Worker
 
 QUIET = {"progress": False, "workers": 1, "compile": False}
