@@ -1,4 +1,4 @@
-"""A finished drawing: shown in a notebook, written to a file."""
+"""A finished drawing: shown in a notebook, written to a file; the library that draws it as pixels."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable
 from functools import cached_property, partial
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from ...blocks.core import OptionError, accepts, check_file, explain_calls, kinds, write_text
 from ..wiring import Structure
 from .diagram_picture import WIDTH, DiagramPicture, find_closed
 from .live import Facts, live_html
-from .printer import printer
 
 SCALE = 2
 """Pixels of a PNG for each pixel of the drawing."""
@@ -143,3 +143,16 @@ def draw(
     page = DiagramPicture(table, shut, width).page(subsystem, subsystem or name)
     live = partial(live_html, table, name, facts, subsystem=subsystem, closed=shut, width=width)
     return Drawing(page.svg, (page.width, page.height), page.about, live)
+
+
+def printer(wanted: str, instead: str, port: str) -> Any:
+    """Return the library; ``wanted`` and ``instead`` say in the error what needs it and what does without."""
+    try:
+        import plutoprint
+    except ImportError as error:
+        raise OptionError(
+            f'{wanted} needs PlutoPrint, which is not installed. Install it: pip install "loopwright[pdf]"; or '
+            f"{instead}.",
+            port=port,
+        ) from error
+    return plutoprint

@@ -51,10 +51,8 @@ from ..linearization import (
 from ..solvers import FIXED
 from .beginning import EXACT, find_beginning, find_continuous_beginning
 from .between_samples import moves_between
-from .injection import InjectionRun, inject_signal
+from .injection import KINDS, InjectionRun, Part, SamplesAtWire, choose_step, inject_signal, plan_signal
 from .measurement import Measurement, measure_part, refine_tolerances
-from .samples_at_wire import SamplesAtWire
-from .waveforms import KINDS, Part, choose_step, plan_signal
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData

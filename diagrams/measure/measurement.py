@@ -10,8 +10,7 @@ import numpy as np
 from ...blocks.core import SimulationError
 from ..flat import FlatDiagram
 from ..solvers import FIXED
-from .injection import InjectionRun
-from .waveforms import Part, compute_phasors
+from .injection import InjectionRun, Part, compute_phasors
 
 MOVED = 1e-3
 """Movement of the operating point, relative to 1 + the size of a state, that refutes a measurement."""

@@ -34,9 +34,8 @@ from ..results import ExpectedStep, OperatingPoint
 from ..wiring import stepped_blocks
 from .beginning import can_start_at, with_ticks
 from .between_samples import BETWEEN, SMOOTH, Instants, WithinSamples, can_step_finer, choose_instants, moves_between
-from .injection import InjectionRun, inject_signal
+from .injection import InjectionRun, SamplesAtWire, inject_signal
 from .predicted_step import Predicted, find_final, predict, predict_within
-from .samples_at_wire import SamplesAtWire
 
 SAMPLES = 1000
 """Samples of the response of a diagram that is not sampled."""

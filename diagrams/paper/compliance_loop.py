@@ -58,7 +58,19 @@ from ...blocks import (
     PlanarModel,
     Reference,
 )
-from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, kinds, parameter
+from ...blocks.core import (
+    Array,
+    Block,
+    Finding,
+    Input,
+    Output,
+    ParameterError,
+    State,
+    UnknownNameError,
+    Value,
+    kinds,
+    parameter,
+)
 from ...blocks.path_following import A_MODEL, A_PATH, planar_slopes
 from ...blocks.paths import Frame
 from ...blocks.tracing import METHOD
@@ -70,7 +82,6 @@ from ..wiring import Wire
 from .fig3_parts import check_wires, delay_of, find_kinks, plant_path
 from .fig3_wires import Channel, Rig, wire
 from .restricted_contact import restrict
-from .robots_at_rest import PerfectRobot, RobotAtRest
 from .shown_plant import check_plant
 
 IMPLEMENTATIONS = ("ideal", "continuous", "sampled")
@@ -335,7 +346,7 @@ def _contact_of(loop: AdmittanceLoop) -> Contact:
 def _perfect_diagram(loop: AdmittanceLoop) -> WiredDiagram:
     a, q = loop.admittance, loop.scale
     mass, damping, stiffness = a.mass / q + loop.tool_mass, float(a.effective_damping) / q, a.stiffness / q
-    plant = PerfectRobot(mass=mass, damping=damping, stiffness=stiffness, name="plant")
+    plant = _PerfectRobot(mass=mass, damping=damping, stiffness=stiffness, name="plant")
     return Diagram("compliance", plant(external_force=Constant(value=0.0, unit="N", name="free_space"))).wired
 
 
@@ -372,9 +383,9 @@ def _path_like(loop: AdmittanceLoop) -> tuple[Path, tuple[float, float]]:
     return circle, (0.75 * circle.length, 1.0 - loop.q)
 
 
-def _robot_of(motion: Motion, path: Path, place: tuple[float, float]) -> RobotAtRest:
+def _robot_of(motion: Motion, path: Path, place: tuple[float, float]) -> _RobotAtRest:
     mobility = np.linalg.inv(motion.mass)
-    return RobotAtRest(mobility=mobility, slope=-mobility @ motion.damping, start=path.to_plane(*place))
+    return _RobotAtRest(mobility=mobility, slope=-mobility @ motion.damping, start=path.to_plane(*place))
 
 
 def _unlimited(admittance: AdmittanceFilter) -> AdmittanceFilter:
@@ -389,3 +400,50 @@ def _with_gain(diagram: WiredDiagram, block: str, port: str, gain: Any) -> Wired
     table.blocks[path], table.subsystem_of[path] = Gain(gain=gain, name=name), subsystem
     table.wires[path, "u"], table.wires[block, port] = table.wires[block, port], Wire(path, "y")
     return diagram.with_structure(table)
+
+
+class _RobotAtRest(PlanarModel):
+    """A robot that is linear around rest: p̈ = S ṗ + G (u + F)."""
+
+    mobility: Array = parameter(shape=(2, 2), unit="1/kg", description="mobility G = M⁻¹")
+    slope: Array = parameter(shape=(2, 2), unit="1/s", description="slope S = −G C of its friction")
+    start: Array = parameter(default=(0.0, 0.0), shape=(2,), unit="m", description="position at the start")
+
+    motor_force = Input(shape=(2,), unit="N", description="motor force u")
+    external_force = Input(shape=(2,), unit="N", description="force F of the environment")
+    position = State(unit="m", shape=(2,), start="start", description="position p", output=True)
+    velocity = State(unit="m/s", start=(0.0, 0.0), description="velocity ṗ", output=True)
+    acceleration = Output(shape=(2,), unit="m/s2", description="acceleration p̈")
+
+    def f_v(self, x_c: Array, x_v: Array) -> Array:
+        """Return S ṗ."""
+        return self.slope @ x_v
+
+    def G_v(self, x_c: Array) -> Array:  # noqa: N802 - the paper's symbol
+        """Return G."""
+        return self.mobility
+
+    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return velocity and acceleration."""
+        return x.velocity, self.output(t, x, u)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the acceleration."""
+        return self.coordinate_acceleration(x.position, x.velocity, u.motor_force, u.external_force)
+
+
+class _PerfectRobot(Block):
+    """A robot whose inner loop is perfect, in one direction: (m/q + m_tool) p̈ = F − d/q ṗ − k/q p."""
+
+    mass: float = parameter(unit="kg", above=0.0, description="m/q, and the mass of the tool")
+    damping: float = parameter(unit="N.s/m", description="d/q")
+    stiffness: float = parameter(unit="N/m", description="k/q")
+
+    external_force = Input(unit="N", description="force F of the environment")
+    position = State(unit="m", start=0.0, description="position p", output=True)
+    velocity = State(unit="m/s", start=0.0, description="velocity ṗ", output=True)
+
+    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return velocity and acceleration."""
+        force = u.external_force - self.damping * x.velocity - self.stiffness * x.position
+        return x.velocity, force / self.mass

@@ -29,14 +29,13 @@ from .pages import (
     read_definitions,
     write_report,
 )
-from .points import point_of
 from .report_parts import ReportKind, ReportPart
 from .sections.loops import DISK_NUMBERS, disk_numbers, disk_range
 from .sections.not_modelled import LIMITS_TITLE
 from .sections.poles import POLES_TITLE, list_poles
 from .sections.subject import SUBJECT_TITLE
 from .stability import scatter, without_memory
-from .variant import Implementation, Variant, in_s, look_of
+from .variant import Implementation, Variant, in_s, look_of, point_of
 
 __all__ = [
     "ANY_DIAGRAM",

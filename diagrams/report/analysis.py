@@ -21,7 +21,6 @@ from .case import Case, ReportedExperiment
 from .case_verdicts import review
 from .content_hash import content_hash
 from .pages import DEFINITIONS, Report
-from .points import STEP
 from .report_parts import ReportKind, ReportPart
 from .sections.contacts import contact_sections, contacts_on_first_page, read_contacts
 from .sections.injection import injected
@@ -34,6 +33,7 @@ from .sections.step_responses import steps
 from .sections.subject import operating_points, remarks, subject, versions
 from .sections.summary import all_requirements, summarize, with_words
 from .sections.worst_case import find_reported, read_task, worst_case_of
+from .variant import STEP
 
 F = TypeVar("F", bound=Callable[..., Any])
 _HEADING = ("title", "author", "project", "date", "revision")  # lines of ``about``

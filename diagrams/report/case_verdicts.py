@@ -21,11 +21,11 @@ from ..requirements import (
 )
 from ..studies import CaseState, StudyCase
 from .case import Case
-from .points import STEP
 from .sections.contacts import ReportedContacts
 from .sections.measured_loops import MEASURED, MeasuredLoop
 from .sections.worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import free_motions
+from .variant import STEP
 from .variant_verdicts import STABLE, VariantReview
 
 

@@ -1,4 +1,7 @@
-"""Variants of a diagram: as it is implemented, and the linear model of each."""
+"""Variants of a diagram: as it is implemented, and the linear model of each at its operating point.
+
+Each runs to its own point, or takes over a given one by the names of states.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +9,34 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import BetweenTicksError, Finding, LoopwrightError, PeriodicLoopError
+from ...blocks.core import BetweenTicksError, Finding, LoopwrightError, OptionError, PeriodicLoopError
 from ..flat import FlatDiagram, WiredDiagram
 from ..frequency import Number, margins
-from ..linearization import FreeMotions, Linearization, find_signal, linearize
+from ..linearization import (
+    FreeMotions,
+    Linearization,
+    capture,
+    find_signal,
+    linearize,
+    operating_point,
+    with_passed_values,
+)
 from ..plotting import BLUE, DARK, GREEN, PURPLE, STONE, VERMILION
-from ..results import OperatingPoint
+from ..results import OperatingPoint, PointOrigin, Snapshot
+from ..simulation import apply_point
 from ..studies import is_zero
-from .points import point_of
 from .wires_on_loops import ways_through
 
 AT_REST = 1e-6
 """Largest change of a state, relative to 1 + its size, at which nothing is said to move."""
+STEP = Fraction(1, 1000)
+"""Communication step in s at which a diagram without a clock is run to its operating point."""
 
 
 class Implementation(StrEnum):
@@ -239,3 +253,41 @@ def in_s(poles: Any, dt: float) -> np.ndarray:
     """Return poles in 1/s; of those of a sampled model, z, without those at z = 0: memory, or a delay."""
     values = np.asarray(poles, dtype=complex)
     return np.asarray(np.log(values[np.abs(values) > 1e-12]) / dt if dt else values)
+
+
+def point_of(diagram: WiredDiagram, where: Any, source: WiredDiagram | None = None) -> OperatingPoint:
+    """Return the operating point of a variant.
+
+    The variant is run to a time in s, or to that of a point which a run has reached. A point that was found or given is
+    taken over by the names of its states; ``source`` is its diagram.
+    """
+    options: dict[str, Any] = {}
+    if diagram.has_fmu and not diagram.has_clock:
+        options["step"] = STEP
+    if isinstance(where, Snapshot) or (isinstance(where, OperatingPoint) and where.how is PointOrigin.RUN):
+        where = where.t
+    if not isinstance(where, OperatingPoint):
+        return operating_point(diagram, where, options)
+    try:
+        where.check_fits(diagram.flatten_like(where), diagram.name)
+    except OptionError:
+        return _taken_over(diagram, where, diagram if source is None else source, options)
+    return with_passed_values(diagram, where)
+
+
+def _taken_over(
+    diagram: WiredDiagram, point: OperatingPoint, source: WiredDiagram, options: dict[str, Any]
+) -> OperatingPoint:
+    """Return a point of another diagram as one of this diagram: its FMUs', and its blocks' states by their names.
+
+    States that only this diagram has, such as those of a delay, take the values that they settle at while all others
+    are held.
+    """
+    from ..simulation import RunOptions, Simulation
+
+    old = source.flatten_like(point)
+    if not diagram.has_clock:
+        options = {**options, "step": point.base}
+    with Simulation(apply_point(diagram, point), RunOptions.of(options, block=diagram.name)) as simulation:
+        simulation.take_over(point.x, old)
+        return replace(capture(simulation, point.how), parameters=point.parameters)

@@ -1,18 +1,25 @@
-"""Wires of a diagram that lie on loops."""
+"""Wires of a diagram that lie on loops, and those of them at which one and the same loop is cut.
+
+The numbers of such wires agree, so that the loop's figures are drawn once.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
 from ..flat import FlatDiagram, WiredDiagram
+from ..frequency import Number
 from ..linearization import SignalPaths, find_signal
 from ..wiring import find_cyclic_parts
 
 MOST = 4
 """Wires at which loops are looked at where none has a name."""
+SAME = 1e-6
+"""Relative difference of two numbers up to which they are those of one loop: far above rounding, far below what a
+figure shows."""
 
 
 def wires_on_loops(diagram: WiredDiagram, wires: Sequence[str] | None = None) -> dict[str, str]:
@@ -68,3 +75,28 @@ def ways_through(flat: FlatDiagram, wire: str, others: Iterable[str]) -> tuple[s
 
 def _key(name: str) -> str:
     return name.replace(".", "_")
+
+
+def find_same(loops: Mapping[str, Mapping[str, Number]]) -> dict[str, str]:
+    """Return the keys of loops that another one shows, with that one's key.
+
+    ``loops`` has the numbers of each loop by its key, by paths that name the variant: a loop is shown by one that has
+    the same numbers, and may have those of further variants.
+    """
+    ranked = sorted((key for key in loops if loops[key]), key=lambda key: -len(loops[key]))  # ties in their order
+    shown: dict[str, str] = {}
+    for i, key in enumerate(ranked):
+        others = (other for other in ranked[:i] if other not in shown)
+        found = next((other for other in others if _contains(loops[other], loops[key])), None)
+        if found is not None:
+            shown[key] = found
+    return shown
+
+
+def _contains(whole: Mapping[str, Number], part: Mapping[str, Number]) -> bool:
+    return all(path in whole and is_same(whole[path].value, number.value) for path, number in part.items())
+
+
+def is_same(a: float, b: float) -> bool:
+    """Whether two numbers are those of one loop."""
+    return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=SAME)

@@ -1,7 +1,15 @@
 """The loop over ticks, and between them."""
 
 from .algebraic_loops import newton_options
-from .block_start_values import find_initial_state, find_start_values, values_from_left
+from .block_start_values import (
+    Port,
+    StartFunctions,
+    TracedStartValues,
+    find_initial_state,
+    find_start_values,
+    trace_start,
+    values_from_left,
+)
 from .bound_loops import bind_hybrid, bind_ticks
 from .continuous import Continuous
 from .engine import Engine
@@ -15,7 +23,6 @@ from .simulation import Simulation, simulate
 from .solver_setup import find_late, next_instant
 from .start_at_point import apply_point, copy_states
 from .stops import StopConditions
-from .traced_start_values import Port, StartFunctions, TracedStartValues, trace_start
 from .view import SimulationView
 from .workspace import Workspace
 

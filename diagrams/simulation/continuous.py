@@ -1,9 +1,13 @@
-"""The continuous part of a run: its method, its events and delays, as the loop in C is set up with them."""
+"""The continuous part of a run: its method, its events and delays, as the loop in C is set up with them.
+
+The loop lands on discontinuities of sources ahead. Coupled plants may go back over a step: then it goes back, too.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +15,7 @@ import numpy as np
 
 from ...blocks.core import Block, FmuRuntimeError, OptionError, ParameterError, SimulationError
 from ..compiled import Domains, MethodOptions, delays_of
+from ..coupling import accept_steps, try_steps
 from ..flat import FlatDiagram, announcers, renumber
 from ..model_exchange import BlocksInModelExchange, OwnEvents
 from ..results import Occurrence
@@ -22,6 +27,7 @@ from .solver_setup import (
     find_late,
     has_guards,
     longest_step,
+    next_instant,
     remembers,
     scales_of,
     time_scale_of,
@@ -33,6 +39,7 @@ _AT_ONCE = 1e-6
 NOTHING: frozenset[Any] = frozenset()
 TIGHT = 1e-9
 """Below this relative tolerance methods of one step, to which a stop costs little, land on every sample."""
+_MOST_EDGES = 100_000  # discontinuities of sources ahead, in a call
 
 
 class Continuous:
@@ -288,3 +295,101 @@ class Continuous:
         self.method.begin_again()
         if self.domains is not None:
             self.domains.begin_again()
+
+
+def find_edges(
+    continuous: Continuous, t: float, end: float, *, limited: bool = True
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the discontinuities of sources from t to the first of each after the end; None if they are too many."""
+    found = set[float]()
+    for path, source in continuous.sources:
+        edge = t
+        while edge <= end and (edge := next_instant(path, source, edge)) < math.inf:
+            found.add(edge)
+            if limited and len(found) > _MOST_EDGES:
+                return None
+    if t in continuous.late:
+        found.add(t)
+    edges = np.array(sorted(found))
+    return edges, np.array([continuous.late.get(float(edge), float(edge)) for edge in edges])
+
+
+class EdgesAhead:
+    """Discontinuities of sources, found once for a stretch of ticks, in however many calls C goes through it."""
+
+    def __init__(self, continuous: Continuous):
+        self._continuous = continuous
+        self._begin, self._end = math.inf, -math.inf
+        self._found = np.zeros(0), np.zeros(0)
+
+    def until(self, t: float, end: float, *, limited: bool) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return those from t on, up to an end and the first one of each source after it; see `find_edges`."""
+        if t < self._begin or end > self._end:
+            found = find_edges(self._continuous, t, end, limited=limited)
+            if found is None:
+                return None
+            self._begin, self._end, self._found = t, end, found
+        edges, late = self._found
+        first = int(np.searchsorted(edges, t, side="left" if t in self._continuous.late else "right"))
+        return edges[first:], late[first:]
+
+
+@dataclass
+class _Saved:
+    t: float
+    x: np.ndarray
+    continuous: Any
+    exchanged: Mapping[str, bytes]
+    messages: tuple[str, ...]
+    events: int
+
+
+class ContinuousPart:
+    """The blocks in continuous time between two ticks: advanced, saved and restored; see `ContinuousRest`."""
+
+    def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: BlocksInModelExchange):
+        self._workspace, self._continuous, self._exchanged = workspace, continuous, exchanged
+        self._events: list[Occurrence] = []  # reported when they are accepted: a pass may be gone back over
+        self.go_between: Callable[[float, float], float | None] | None = None
+        """Takes them from one instant to another, as `HybridTicks.go_between`; None where nothing happens between."""
+        if continuous is not None:
+            self._report = continuous.on_event
+            continuous.on_event = self._events.append
+
+    def advance(self, t: float, end: float) -> float | None:
+        """Go from t to the end, both in s; return the time at which a stop condition has ended the run."""
+        if self._continuous is None:
+            return None
+        assert self.go_between is not None
+        self._workspace.here.t[0] = t
+        if self._continuous.delays is not None:
+            self._continuous.delays.note_edge(t)  # the outputs of the plants have jumped
+        return self.go_between(t, end)
+
+    def save(self) -> _Saved:
+        """Return the present state."""
+        here, workspace = self._workspace.here, self._workspace
+        continuous = None if self._continuous is None else self._continuous.save()
+        try_steps(self._exchanged.blocks.values())
+        exchanged = {path: block.serialize() for path, block in self._exchanged.blocks.items()}
+        return _Saved(float(here.t[0]), here.x.copy(), continuous, exchanged, workspace.messages, len(self._events))
+
+    def restore(self, saved: _Saved) -> None:
+        """Go back to a state."""
+        here, workspace = self._workspace.here, self._workspace
+        here.t[0], here.x[:] = saved.t, saved.x
+        workspace.messages = saved.messages
+        del self._events[saved.events :]
+        for path, block in self._exchanged.blocks.items():
+            block.restore_bytes(saved.exchanged[path])
+            block.refused = None
+        if self._continuous is not None:
+            self._continuous.restore(saved.continuous)
+
+    def accept(self) -> None:
+        """Report the events that have happened, and raise the error of an input that was out of its range."""
+        accept_steps(self._exchanged.blocks.values())
+        if self._events:
+            for event in self._events:
+                self._report(event)
+            self._events.clear()

@@ -20,10 +20,9 @@ from ..flat import FlatDiagram
 from ..model_exchange import BlocksInModelExchange, ModelExchangeBlock
 from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
-from .block_start_values import find_start_values
+from .block_start_values import choose_start_values, find_start_values
 from .change_over import ChangeOver
-from .continuous import Continuous
-from .continuous_part import ContinuousPart
+from .continuous import Continuous, ContinuousPart
 from .failed_blocks import opaque_failure
 from .hybrid_ticks import HybridTicks
 from .initialize import Initialization
@@ -33,7 +32,6 @@ from .sampled_ticks import SampledTicks
 from .start_at_point import check_past, start_at, take_over
 from .stops import StopConditions
 from .ticks_in_c import find_code, functions_of
-from .traced_start_values import choose_start_values
 from .view import Position, SimulationView
 from .workspace import Workspace
 

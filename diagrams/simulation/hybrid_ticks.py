@@ -24,10 +24,9 @@ from ..flat import EVERY, NONE, TickPattern, ticks_after, times_of
 from ..results import Recorder
 from .bound_loops import bind_hybrid
 from .broken_off import explain, explain_library, pile_up
-from .continuous import Continuous
+from .continuous import Continuous, EdgesAhead, find_edges
 from .failed_blocks import forget_trials
 from .plants_in_c import PlantsInC
-from .source_edges import EdgesAhead, find_edges
 from .ticks_in_c import WISHED, TicksInC
 
 

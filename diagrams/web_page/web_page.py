@@ -18,9 +18,8 @@ from ..flat import WiredDiagram
 from ..results import Run
 from ..wiring import Wire
 from .module import make_module
-from .notebook_link import Change, PageRecord, runs_in_kernel
+from .notebook_link import Change, PageRecord, repeat, runs_in_kernel
 from .page_html import DATA_BEGIN, PageText, Scene, choose_drawing, draw_still, fill_page
-from .repeated import repeat
 from .shown_signals import PlotNames, ShownColumns, plots_of
 from .sliders import Slider, default_sources, find_sliders, place_of
 

@@ -3,8 +3,7 @@
 from ...plotting import AxisUnits
 from .contact_figures import DOTTED, contact_admittance, contact_map, draw_admittances, fill_growth
 from .drawings import with_drawing
-from .loop_figures import DrawnLoops, bode, gang, nyquist, response, sensitivities
-from .measured_figures import MeasuredCurve, injected, measured
+from .loop_figures import DrawnLoops, MeasuredCurve, bode, gang, injected, measured, nyquist, response, sensitivities
 from .overview_figures import HEIGHTS, fit_overview, overview_bode, overview_step
 from .sensitivity_figures import sensitivity_bars
 from .step_figures import step_responses

@@ -36,9 +36,8 @@ from .. import figures
 from ..case import Case
 from ..error_sentences import say, say_found
 from ..pages import Plot, Section, Table, TableForm, Texts, compare_columns
-from ..same_loops import find_same
 from ..variant import Cut, Variant, in_s
-from ..wires_on_loops import blocks_on_loops
+from ..wires_on_loops import blocks_on_loops, find_same
 from .poles import list_poles
 
 TEXTS = Texts(__package__, "loops")

@@ -25,8 +25,7 @@ from .. import figures
 from ..case import Case
 from ..error_sentences import say
 from ..pages import Plot, Section, TableForm, Texts
-from ..points import STEP
-from ..variant import Variant
+from ..variant import STEP, Variant
 from .loops import ROWS
 
 TEXTS = Texts(__package__, "measured")

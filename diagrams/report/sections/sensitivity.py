@@ -12,7 +12,7 @@ from .. import figures
 from ..case import Case
 from ..error_sentences import say
 from ..pages import Section, TableForm, Texts
-from ..same_loops import find_same, is_same
+from ..wires_on_loops import find_same, is_same
 from .loops import ROWS
 
 TEXTS = Texts(__package__, "sensitivity")

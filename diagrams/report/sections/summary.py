@@ -29,9 +29,9 @@ from ..case import Case
 from ..case_verdicts import weakest
 from ..figures import HEIGHTS, fit_overview
 from ..pages import SUMMARY, Judged, Plot, Section, Table, Texts, compare_columns
-from ..same_loops import find_same
 from ..stability import free_motions
 from ..variant import Cut, Implementation, Variant
+from ..wires_on_loops import find_same
 from .contacts import KEY as CONTACT
 from .loops import ROWS
 from .measured_loops import MEASURED

@@ -23,8 +23,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
 from loopwright.diagrams.linearization.taps import find_signal
-from loopwright.diagrams.measure.injection import inject_signal, times_of
-from loopwright.diagrams.measure.waveforms import compute_phasors, plan_signal
+from loopwright.diagrams.measure.injection import compute_phasors, inject_signal, plan_signal, times_of
 from loopwright.diagrams.simulation import Simulation
 from loopwright.fmus import Fmu, gantry, mass_spring_damper
 

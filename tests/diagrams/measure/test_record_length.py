@@ -5,8 +5,8 @@ import pytest
 
 from loopwright.blocks import BandLimitedNoise, Constant, DiscreteIntegrator, Gain, Integrator, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.measure.injection import SAMPLES, plan_signal
 from loopwright.diagrams.measure.measurement import Measurement, measure_part
-from loopwright.diagrams.measure.waveforms import SAMPLES, plan_signal
 from loopwright.diagrams.report import Case
 from loopwright.diagrams.report.case import SAMPLES as LONGEST
 from loopwright.diagrams.report.case import SOLVED, InjectionPlan

@@ -9,9 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from loopwright.diagrams.report.pages.document import Plot, Section, Table
-from loopwright.diagrams.report.pages.filled_pages import LEAST, fill_pages
 from loopwright.diagrams.report.pages.html import to_html
-from loopwright.diagrams.report.pages.pdf import write_pdf
+from loopwright.diagrams.report.pages.pdf import LEAST, fill_pages, write_pdf
 from loopwright.diagrams.report.pages.report import Report
 
 TALL, WIDE = 3.3, 6.6

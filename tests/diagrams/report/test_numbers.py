@@ -10,7 +10,7 @@ from loopwright.blocks import PID, Constant, ErrorDynamics, Gain, Integrator, Op
 from loopwright.diagrams import ConfirmationError, Diagram, analyse, experiments, subsystem
 from loopwright.diagrams.paper.fig3_case import Fig3Case
 from loopwright.diagrams.report.case import delayed_subsystems
-from loopwright.diagrams.report.points import point_of
+from loopwright.diagrams.report.variant import point_of
 from loopwright.diagrams.report.wires_on_loops import wires_on_loops
 from loopwright.fmus import Fmu, dc_motor
 

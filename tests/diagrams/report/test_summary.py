@@ -17,8 +17,8 @@ from loopwright.diagrams import Diagram, Plot, Requirements, Section, Table, ana
 from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.report.pages.report import write_report
-from loopwright.diagrams.report.same_loops import find_same
 from loopwright.diagrams.report.sections.summary import MOST_REQUIREMENTS
+from loopwright.diagrams.report.wires_on_loops import find_same
 from loopwright.frequency import Number
 from loopwright.types import Report, Verdict
 
