@@ -346,7 +346,7 @@ def _contact_of(loop: AdmittanceLoop) -> Contact:
 def _perfect_diagram(loop: AdmittanceLoop) -> WiredDiagram:
     a, q = loop.admittance, loop.scale
     mass, damping, stiffness = a.mass / q + loop.tool_mass, float(a.effective_damping) / q, a.stiffness / q
-    plant = _PerfectRobot(mass=mass, damping=damping, stiffness=stiffness, name="plant")
+    plant = PerfectRobot(mass=mass, damping=damping, stiffness=stiffness, name="plant")
     return Diagram("compliance", plant(external_force=Constant(value=0.0, unit="N", name="free_space"))).wired
 
 
@@ -383,9 +383,9 @@ def _path_like(loop: AdmittanceLoop) -> tuple[Path, tuple[float, float]]:
     return circle, (0.75 * circle.length, 1.0 - loop.q)
 
 
-def _robot_of(motion: Motion, path: Path, place: tuple[float, float]) -> _RobotAtRest:
+def _robot_of(motion: Motion, path: Path, place: tuple[float, float]) -> RobotAtRest:
     mobility = np.linalg.inv(motion.mass)
-    return _RobotAtRest(mobility=mobility, slope=-mobility @ motion.damping, start=path.to_plane(*place))
+    return RobotAtRest(mobility=mobility, slope=-mobility @ motion.damping, start=path.to_plane(*place))
 
 
 def _unlimited(admittance: AdmittanceFilter) -> AdmittanceFilter:
@@ -402,7 +402,7 @@ def _with_gain(diagram: WiredDiagram, block: str, port: str, gain: Any) -> Wired
     return diagram.with_structure(table)
 
 
-class _RobotAtRest(PlanarModel):
+class RobotAtRest(PlanarModel):
     """A robot that is linear around rest: p̈ = S ṗ + G (u + F)."""
 
     mobility: Array = parameter(shape=(2, 2), unit="1/kg", description="mobility G = M⁻¹")
@@ -432,7 +432,7 @@ class _RobotAtRest(PlanarModel):
         return self.coordinate_acceleration(x.position, x.velocity, u.motor_force, u.external_force)
 
 
-class _PerfectRobot(Block):
+class PerfectRobot(Block):
     """A robot whose inner loop is perfect, in one direction: (m/q + m_tool) p̈ = F − d/q ṗ − k/q p."""
 
     mass: float = parameter(unit="kg", above=0.0, description="m/q, and the mass of the tool")
