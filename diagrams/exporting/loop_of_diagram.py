@@ -109,7 +109,7 @@ def loop_spec(
         continuous = _continuous(workspace, name, solver, rtol, atol, step)
         bound = _bind_hybrid(continuous, acting, code)
         memory = read_memory({"hybrid": bound.structure}, vectors, bound.kept, code)
-        facts["edges"], facts["periodic"] = find_edges(opened, continuous.sources)
+        facts["edges"], facts["periodic"] = _find_edges(continuous.sources)
         facts["events"] = tuple((opened.shown(e.path), e.name, e.subsystem) for e in flat.events)
         left = trace_left(workspace)
         facts["left"] = None if left is None else CFunction.of(left)
@@ -288,7 +288,7 @@ def _start_kind(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], nam
     return acting.index(every)
 
 
-def find_edges(opened: OpenDiagram, sources: Sequence[tuple[str, Announcer]]) -> tuple[Edges, Edges]:
+def _find_edges(sources: Sequence[tuple[str, Announcer]]) -> tuple[Edges, Edges]:
     """Return discontinuities of sources, each with the time at which it is seen there; and first ones with periods.
 
     Raises `DefinitionError`: for a source with very many of them that don't repeat.
