@@ -173,10 +173,13 @@ class Variant:
 
         Where the loops through slower subsystems make the loop periodic, they are open.
         """
-        try:
-            return Cut.PLAIN, self.title, self.loop(wire)
-        except PeriodicLoopError:
-            return Cut.SLOW_OPEN, f"{self.title}, slow loops open", self.loop(wire, cut=Cut.SLOW_OPEN)
+        if (wire, "fullest") not in self._loops:
+            try:
+                found = Cut.PLAIN, self.title, self.loop(wire)
+            except PeriodicLoopError:
+                found = Cut.SLOW_OPEN, f"{self.title}, slow loops open", self.loop(wire, cut=Cut.SLOW_OPEN)
+            self._loops[wire, "fullest"] = found
+        return self._loops[wire, "fullest"]  # type: ignore[no-any-return]
 
     def acts_between_ticks(self, wire: str) -> bool:
         """Return whether a wire has no loop as it changes between ticks, and blocks in continuous time use it there."""
@@ -188,11 +191,19 @@ class Variant:
             return False
         return False
 
+    def goes_by_slower(self, wire: str) -> bool:
+        """Return whether nothing comes back to a wire but through slower subsystems, as behind a fast sensor."""
+        try:
+            cut, _, L = self.fullest_loop(wire)
+        except LoopwrightError:
+            return False
+        return cut is Cut.SLOW_OPEN and is_zero(L)
+
     def loops_elsewhere(self, wire: str, others: Iterable[str]) -> tuple[str, ...]:
-        """Return those of other wires that each loop through a wire without a loop at ticks goes through."""
-        # none where the wire has a loop, and where a loop goes through none of the others
-        others = tuple(others)
-        if not others or not self.acts_between_ticks(wire):
+        """Return those of other wires that each loop through a wire without a loop at its own ticks goes through."""
+        # none where the wire has such a loop, and where a loop goes through none of the others
+        others = tuple(other for other in others if not self.goes_by_slower(other))
+        if not others or not (self.acts_between_ticks(wire) or self.goes_by_slower(wire)):
             return ()
         return ways_through(self.diagram.flatten_like(self.point), wire, others)
 

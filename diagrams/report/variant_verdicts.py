@@ -151,8 +151,8 @@ class VariantReview:
         own, mine = asked.limits_named(names, v.key), numbers_below(self.numbers, start)
         for name, limit in asked.limits_of(names, v.key).items():
             rest = _find_worst(mine, name, limit)
-            if rest is None and name not in own:
-                if self._has_channels(key):
+            if name not in own:
+                if rest is None and self._has_channels(key):
                     continue  # a general limit of single loops
                 if key in self.wires and v.loops_elsewhere(self.wires[key], self._wires_judged(name)):
                     continue  # its loops are judged at other wires
@@ -233,8 +233,8 @@ class VariantReview:
         step = self.asked.step_of(names, self.v.key)
         if step is None or key not in self.wires:
             return
-        is_general = step is not self.asked.step_named(names, self.v.key)
-        if is_general and self.v.loops_elsewhere(self.wires[key], self._wires_stepped(step)):
+        is_general, wire = step is not self.asked.step_named(names, self.v.key), self.wires[key]
+        if is_general and self.v.acts_between_ticks(wire) and self.v.loops_elsewhere(wire, self._wires_stepped(step)):
             return  # a general limit, judged at other wires of the loop
         for result in self._step(key, step, loop=key):
             yield self._compare_other_steps(result)

@@ -117,7 +117,7 @@ class VariantLoop:
     cut: Cut
     title: str
     L: Any
-    margins: Margins
+    margins: Margins | None  # None where all of the loop goes through slower subsystems, which are open in L
     periodic: PeriodicMargins | None  # of a loop whose slower loops are open in ``margins``
     theirs: tuple[Comparison, ...]
     notes: tuple[str, ...]
@@ -131,7 +131,7 @@ class VariantLoop:
     def own(self) -> dict[Cut, dict[str, Number]]:
         """The numbers of its margins by the ends of their paths, in each way in which it is cut."""
         m, p = self.margins, self.periodic
-        found = {self.cut: with_findings(_numbers(m, self.L), m.findings)}
+        found = {} if m is None else {self.cut: with_findings(_numbers(m, self.L), m.findings)}
         return found if p is None else {**found, Cut.PERIODIC: with_findings(_periodic_numbers(p), p.findings)}
 
     @property
@@ -143,6 +143,8 @@ class VariantLoop:
             for name, number in numbers.items()
         }
         m = self.margins
+        if m is None:
+            return found
         return found | {f"{self.key}.control.{c.name}": with_findings(_theirs(m, c), m.findings) for c in self.theirs}
 
 
@@ -204,11 +206,14 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     numbers = {path: number for of in loops for path, number in of.numbers.items()}
     section = Section(key, f"Loop at {wire}", tuple(text), tuple(_tables(wire, loops)), (), numbers, absent=absent)
     own = {(of.variant, cut): found for of in loops for cut, found in of.own.items()}
-    shown = {of.key: of for of in loops if of.variant.is_design or of.variant.is_actual}
+    with_margins = {of.key: of.margins for of in loops if of.margins is not None}
+    if not with_margins:
+        return LoopPart(section, own)
+    shown = {of.key: of for of in loops if of.key in with_margins and (of.variant.is_design or of.variant.is_actual)}
     drawn = figures.DrawnLoops(
         wire,
         {at: of.L for at, of in shown.items()},
-        {of.key: of.margins for of in loops},
+        with_margins,
         {of.key: of.title for of in loops},
         {at: case.looks[of.variant.key] for at, of in shown.items()},
         case.axes,
@@ -218,6 +223,10 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
 
 def _analyse(case: Case, wire: str, v: Variant, cut: Cut, title: str, L: Any) -> VariantLoop:
     """Return the loop at a wire in a variant with its margins, and what there is to say of them."""
+    if v.goes_by_slower(wire):
+        p = periodic_margins(v.loop(wire, cut=Cut.PERIODIC))
+        said = (TEXTS.line("slower_alone", variant=v.title, wire=wire), *_unstable(v.title, p))
+        return VariantLoop(v, cut, title, L, None, p, (), said)
     m = margins(L)
     periodic, theirs, notes = None, tuple[Comparison, ...](), list[str]()
     low, high = m.gain_margin_low.value, m.gain_margin_high.value
@@ -232,15 +241,13 @@ def _analyse(case: Case, wire: str, v: Variant, cut: Cut, title: str, L: Any) ->
             periodic = periodic_margins(v.loop(wire, cut=Cut.PERIODIC))
         except LoopwrightError as error:
             notes.append(f"{v.title}: {say(error)}")
-    if periodic is not None and not periodic.stable:
-        shown = _poles(periodic.unstable_poles, periodic.dt)
-        notes.append(TEXTS.line("unstable", variant=v.title, poles=shown))
+        else:
+            notes += _unstable(v.title, periodic)
+    notes += _unstable(title, m)
     # python-control is asked about the design alone: a stable, rational loop, as its functions know no other
-    if not m.stable:
-        notes.append(TEXTS.line("unstable", variant=title, poles=_poles(m.unstable_poles, L.dt)))
-    elif v.is_design and isinstance(L, delayed_system_class()):
+    if m.stable and v.is_design and isinstance(L, delayed_system_class()):
         notes.append(TEXTS.line("no_rational_model", variant=title))
-    elif v.is_design:
+    elif m.stable and v.is_design:
         case.notify(f"confirming the margins at {wire}, {v.title}")
         try:
             with np.errstate(all="ignore"):
@@ -251,21 +258,24 @@ def _analyse(case: Case, wire: str, v: Variant, cut: Cut, title: str, L: Any) ->
     return VariantLoop(v, cut, title, L, m, periodic, theirs, tuple(notes))
 
 
+def _unstable(title: str, m: Margins | PeriodicMargins) -> list[str]:
+    """Return that a closed loop is unstable, with its poles; nothing of a stable one."""
+    return [] if m.stable else [TEXTS.line("unstable", variant=title, poles=_poles(m.unstable_poles, m.dt))]
+
+
 def _tables(wire: str, loops: Sequence[VariantLoop]) -> Iterator[Table]:
     """Yield the tables of the loop at a wire: its margins, and the details of the appendix."""
-    sampled = any(of.L.dt for of in loops)
-    names = {name: words for name, words in ROWS.items() if sampled or name != "delay_margin_samples"}
-    yield compare_columns(f"Margins at {wire}", names, [(of.title, of.margins.numbers()) for of in loops])
-    yield CROSSINGS.fill((row for of in loops for row in _crossings(of)), wire=wire)
-    poles = (
-        {
-            "variant": of.title,
-            "poles": _poles(of.margins.closed_loop_poles, of.L.dt),
-            "hidden": _poles(of.margins.hidden_poles, of.L.dt),
-        }
-        for of in loops
-    )
-    yield CLOSED_LOOP_POLES.fill(poles, "Multiple poles scatter, as ε^(1/multiplicity).", wire=wire)
+    found = [(of.title, of.margins, of.L.dt) for of in loops if of.margins is not None]
+    if found:
+        sampled = any(dt for _, _, dt in found)
+        names = {name: words for name, words in ROWS.items() if sampled or name != "delay_margin_samples"}
+        yield compare_columns(f"Margins at {wire}", names, [(title, m.numbers()) for title, m, _ in found])
+        yield CROSSINGS.fill((row for title, m, _ in found for row in _crossings(title, m)), wire=wire)
+        poles = (
+            {"variant": title, "poles": _poles(m.closed_loop_poles, dt), "hidden": _poles(m.hidden_poles, dt)}
+            for title, m, dt in found
+        )
+        yield CLOSED_LOOP_POLES.fill(poles, "Multiple poles scatter, as ε^(1/multiplicity).", wire=wire)
     periodic = [(of.variant.title, of.periodic) for of in loops if of.periodic is not None]
     if periodic:
         every = {**ROWS, "disk_frequency": "disk margin at"}
@@ -342,12 +352,12 @@ def _theirs(m: Margins, c: Comparison) -> Number:
     return Number(c.control, unit, error, f"python-control's {c.function}; right: {c.right}; {c.why}")
 
 
-def _crossings(of: VariantLoop) -> Iterator[dict[str, Any]]:
+def _crossings(title: str, m: Margins) -> Iterator[dict[str, Any]]:
     """Yield the facts of `CROSSINGS` of a loop."""
-    for c in of.margins.gain_crossovers:
-        yield {"variant": of.title, "kind": "|L| = 1", "frequency": c.frequency, "margin": c.phase_margin_deg}
-    for p in of.margins.phase_crossovers:
-        yield {"variant": of.title, "kind": "L < 0", "frequency": p.frequency, "margin": p.gain_margin}
+    for c in m.gain_crossovers:
+        yield {"variant": title, "kind": "|L| = 1", "frequency": c.frequency, "margin": c.phase_margin_deg}
+    for p in m.phase_crossovers:
+        yield {"variant": title, "kind": "L < 0", "frequency": p.frequency, "margin": p.gain_margin}
 
 
 def _poles(poles: Iterable[complex], dt: float) -> str:

@@ -305,9 +305,11 @@ def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
     found = {path.split(".")[1] for path in numbers if path.split(".")[0::2][:2] == ["inner", actual.key]}
     analysed = [wire for key, wire in case.loop_wires().items() if key in found]
     for key, wire in case.loop_wires().items():
-        if "inner" in case.keys and key not in found:
+        by_slower = key in found and actual.goes_by_slower(wire)
+        if "inner" in case.keys and (key not in found or by_slower):
             elsewhere, judged = actual.loops_elsewhere(wire, analysed), case.requirements is not None
-            yield TEXTS.line("loop_left_out", wire=wire, elsewhere=elsewhere, judged=judged)
+            if elsewhere or not by_slower:
+                yield TEXTS.line("loop_left_out", wire=wire, elsewhere=elsewhere, judged=judged, by_slower=by_slower)
     yield from _apart(case, numbers)
     model = _model(actual)
     if model is not None and not actual.rests and not actual.moving_alone:

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Constant, Gain, OptionError, StateSpace
+from loopwright.blocks import PT1, Constant, Gain, OptionError, StateSpace
 from loopwright.diagrams import Diagram, Requirements, analyse, subsystem
 from loopwright.diagrams.measure import step_response
 from loopwright.diagrams.requirements import Reason
 from loopwright.types import Verdict
+from support.reviewed import judge_again
 
 A = np.array([[-250.0, -50.0], [100.0, -0.1]])
 B = np.array([500.0, 0.0])
@@ -138,3 +139,55 @@ def test_sensitivities_say_which_wires_have_none_without_programs_text():
     (line,) = (text for text in section.text if "voltage" in text)
     assert line.endswith("Sensitivities exist for wires that are renewed once in it.")
     assert "(" not in line
+
+
+LEVEL, FILTER, EVERY = 3.0, 0.2, 4
+"""Time constants of a tank and of its sensor's filter in s, and ticks of 0.1 s of the sensor for one of the law."""
+
+
+def tank():
+    """A tank whose level is filtered every 0.1 s, ahead of a P controller at 0.4 s, whose wish is renewed every 0.8 s."""
+    level = PT1(gain=2.0, time_constant=LEVEL, name="tank")
+    sensor = subsystem(sample_time=0.1, name="sensor")(lambda y: PT1(time_constant=FILTER)(y).y.named("seen"))
+    planner = subsystem(sample_time=0.2 * EVERY, name="planner")(lambda y: Gain(gain=-0.2)(y).y.named("wish"))
+    law = subsystem(sample_time=0.1 * EVERY, name="law")(lambda r, y: Gain(gain=2.0)(r - y).y.named("u"))
+    seen = sensor(level.y)
+    return Diagram("tank", level(law(planner(seen), seen)))
+
+
+def tank_is_stable(factor):
+    """Return whether tank and filter come to rest, u times a factor, from one tick of the planner to the next."""
+    slow, fast, ends = np.exp(-0.1 / LEVEL), np.exp(-0.1 / FILTER), []
+    for y, seen in np.eye(2):
+        u, wish = 0.0, -0.2 * seen
+        for k in range(2 * EVERY):
+            u = 2.0 * factor * (wish - seen) if k % EVERY == 0 else u
+            y, seen = slow * y + 2.0 * (1.0 - slow) * u, fast * seen + (1.0 - fast) * y
+        ends.append([y, seen])
+    return bool(np.max(np.abs(np.linalg.eigvals(np.array(ends)))) < 1.0)
+
+
+@pytest.mark.slow
+def test_a_sensor_that_is_faster_than_its_controller_leaves_the_verdict_to_the_controllers_wire():
+    """With slower loops open nothing comes back to the sensor's wire: its loop was the constant 0, of no number."""
+    asked = {"gain_margin_high": 2.0, "ms": 1.9, "loops": {"seen": {"gain_margin_high": 2.0, "bandwidth": 1.0}}}
+    report = analyse(tank(), only=("poles", "inner"), requirements=Requirements(**asked))
+    found = {(r.loop, r.quantity): r for r in report.review.results if r.loop}
+    assert {key: r.verdict for key, r in found.items()} == {
+        ("u", "gain_margin_high"): Verdict.PASSED,
+        ("u", "ms"): Verdict.PASSED,
+        ("wish", "gain_margin_high"): Verdict.PASSED,
+        ("wish", "ms"): Verdict.PASSED,
+        ("seen", "gain_margin_high"): Verdict.PASSED,
+        ("seen", "bandwidth"): Verdict.UNDECIDED,
+    }
+    largest = found["seen", "gain_margin_high"].number.value
+    assert found["u", "gain_margin_high"].number.value == pytest.approx(largest, rel=1e-8)
+    assert tank_is_stable(0.999 * largest)
+    assert not tank_is_stable(1.001 * largest)
+    assert found["seen", "gain_margin_high"].path == "inner.seen.sampled_d0.periodic.gain_margin_high"
+    assert found["seen", "bandwidth"].reason is Reason.PERIODIC
+    said = "The loop at sensor.seen: it goes through slower subsystems alone, so it has no margins at its own rate; the"
+    assert said in "\n".join(report.sections[0].text)
+    above = judge_again(tank(), report, gain_margin_high=1.01 * largest)
+    assert {r.loop: r.verdict for r in above.results if r.loop} == {"u": Verdict.FAILED, "wish": Verdict.PASSED}
