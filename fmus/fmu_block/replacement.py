@@ -59,7 +59,9 @@ def check_replacement(fmu: PortMembers, old: Block, wired: Collection[str], read
     kinds = {misfit.error for misfit in misfits if misfit.error is not UnwiredInputError or not both}
     lines = "\n".join(f"- {misfit.text}" for misfit in misfits)
     advice = "Wire what is extra, give it a value in start=, or take another FMU."
-    if both:
+    if kinds == {UnitError}:
+        advice = "Convert units, or take another FMU."
+    elif both:
         advice = f"Perhaps only names differ: Fmu({str(fmu.file)!r}, rename={both!r})."
         left = _find_misfits(fmu.replace(rename=both), old, wired, read)[0]
         advice += " Wire what is then extra, or give it a value in start=." if left else ""
@@ -196,7 +198,8 @@ def _compare(
     one, other = new.unit, old.unit
     if isinstance(one, str) and isinstance(other, str) and not _fits(one, other, converts=converts):
         way = (other, one) if side == "input" else (one, other)
-        text = f"{side} {name}: found the unit {one}; expected {other}: {describe_mismatch(*way)}"
+        remedy = ", or give the FMU convert_units=True" if same_dimension(one, other) else ""
+        text = f"{side} {name}: found the unit {one}; expected {other}: {describe_mismatch(*way)}{remedy}"
         found.append(_Misfit(UnitError, text))
     if side == "input" and before is not None and _kind(variable) not in _ACCEPTED_BY[_kind(before)]:
         text = f"input {name}: found the type {variable.type}; expected {before.type}, whose values it would refuse"

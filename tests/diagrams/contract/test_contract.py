@@ -67,7 +67,7 @@ def test_the_library_keeps_the_contract(block, options, frames):
 
 def test_every_public_block_is_among_them():
     missing = {cls.__name__ for cls in public_blocks()} - set(map(named, CASES))
-    assert not missing, f"give {missing} a line in tests/diagrams/library.py"
+    assert not missing, f"give {missing} a line in tests/support/library.py"
 
 
 def test_the_page_of_the_library_has_a_line_for_each_block_as_it_is():

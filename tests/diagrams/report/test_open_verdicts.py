@@ -159,9 +159,10 @@ def test_a_required_response_that_the_linear_model_does_not_have_is_named_on_the
     lines = [text for text in report.sections[0].text if "does not hold at this step" in text]
     assert (difference < 0.01) == holds
     said = (
-        f"- wish.y → place.y: the linear model does not hold at this step; it differs from the run by {difference:.2g}"
+        "- wish.y → place.y: the linear model does not hold at this step; the signal that differs most from the run, "
     )
-    assert lines == ([] if holds else [f"{said} of the largest change."])
+    said += f"the response or a command on the way to it, differs by {difference:.2g} of its largest change."
+    assert lines == ([] if holds else [said])
 
 
 def test_requirements_of_a_loop_stand_together_behind_those_that_fail():

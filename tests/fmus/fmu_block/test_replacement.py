@@ -94,8 +94,13 @@ def test_ports_that_could_be_each_other_are_offered_in_their_order_as_a_guess(di
 
 def test_another_unit_is_said_with_its_factor(diagram, file, tmp_path):
     other = edited(file, tmp_path, (r'(?s)(name="position\[.\]".{0,300}?unit=)"m"', r'\1"mm"'))
-    with pytest.raises(UnitError, match=r"- output position: found the unit mm; expected m: .*by a factor of 0\.001"):
+    with pytest.raises(
+        UnitError, match=r"- output position: found the unit mm; expected m: .*by a factor of 0\.001"
+    ) as e:
         diagram.replace(plant=Fmu(other))
+    assert ", or give the FMU convert_units=True\n" in str(e.value)
+    assert "Wire what is extra" not in str(e.value)
+    diagram.replace(plant=Fmu(other, convert_units=True))
 
 
 def test_another_shape_is_said(diagram, file, tmp_path):
