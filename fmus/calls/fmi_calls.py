@@ -213,10 +213,14 @@ class FmiCalls(ABC):
     def renew(self, log: Log, running: bool) -> None:
         """Free the instance, terminated if it is running, and make another one; its messages go to ``log``.
 
-        Calls that are bound are then of the new one.
+        Calls that are bound are then of the new one. An instance may be freed after an error of its termination.
         """
         if running:
-            self.terminate()
+            try:
+                self.terminate()
+            except call_error_type() as error:
+                if error.status == FATAL:
+                    raise
         getattr(self.fmu, f"{self.prefix}{self.freeing}")(self.fmu.component)
         self.instantiate(log)
         self.instance_argument.value = self.fmu.component

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,11 @@ class FmuPoint:
             )
         return Layout.of({v.name: v.shape for v in variables}).split(vector)
 
+    def initialize(self, instance: LoadedFmu, moved: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Enter Initialization Mode at the point with some values moved; it sets those with an exact start value."""
+        given = {n: v for n, v in {**self.given, **moved}.items() if self.about.find(n).initial == "exact"}
+        instance.initialize(None, start_time=self.t, values=given)
+
     def lost(self, found: np.ndarray) -> dict[str, np.ndarray]:
         """Return the states that were set, and are others now by more than rounding, with their values."""
         parts = self.about.layout(self.states).split(found).items()
@@ -190,7 +196,7 @@ def initialize_in_exchange(point: FmuPoint) -> Iterator[LoadedFmu]:
     """Load the FMU for model exchange, and enter Initialization Mode at the operating point."""
     instance = LoadedFmu(point.setup, model_exchange=True)
     try:
-        instance.initialize(None, start_time=point.t, values=_exact(point, {}))
+        point.initialize(instance)
         yield instance
     finally:
         instance.close()
@@ -201,7 +207,7 @@ def initialize_to_step(point: FmuPoint) -> Iterator[FmuInstance]:
     """Load the FMU for co-simulation, and enter Initialization Mode at the operating point."""
     instance = open_to_step(point.setup)
     try:
-        instance.initialize(None, start_time=point.t, values=_exact(point, {}))
+        point.initialize(instance)
         yield instance
     finally:
         instance.close()
@@ -235,13 +241,9 @@ def step_from(point: FmuPoint, instance: FmuInstance, h: float, moved: Mapping[s
     if the step ends early.
     """
     instance.reset()
-    instance.initialize(None, start_time=point.t, values=_exact(point, moved))
+    point.initialize(instance, moved)
     instance.begin()
     instance.call("setting its inputs", instance.set_values, {n: moved[n] for n in point.inputs if n in moved})
     before = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
     take_step(instance, point.t, h, f"it ends its step early, so {lost}.")
     return before
-
-
-def _exact(point: FmuPoint, moved: Mapping[str, Any]) -> dict[str, Any]:
-    return {n: v for n, v in {**point.given, **moved}.items() if point.about.find(n).initial == "exact"}

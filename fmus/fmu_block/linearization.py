@@ -220,9 +220,8 @@ def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray
 
 def _initialize_again(point: FmuPoint, instance: LoadedFmu) -> None:
     """Go back to Initialization Mode at the operating point."""
-    given = {n: v for n, v in point.given.items() if point.about.find(n).initial == "exact"}
     instance.reset()
-    instance.initialize(None, start_time=point.t, values=given)
+    point.initialize(instance)
 
 
 @contextmanager

@@ -283,10 +283,10 @@ def test_what_it_writes_into_its_resources_is_not_there_in_the_next_run(folder):
     end_idle()
 
 
-@pytest.mark.parametrize("isolate", [False, True])
-def test_a_foreign_fmu_is_not_reset_but_made_anew(folder, isolate):
-    """Its reset fails; a fresh instance begins at y = 0 again."""
-    plant = Fmu(zoo_fmu(folder, 3, "reset error"), name="plant", isolate=isolate)
+@pytest.mark.parametrize(("isolate", "fault"), [(False, "terminate error"), (True, "reset error")])
+def test_a_foreign_fmu_is_not_reset_but_made_anew(folder, isolate, fault):
+    """Its reset fails, or its termination; a fresh instance begins at y = 0 again."""
+    plant = Fmu(zoo_fmu(folder, 3, fault), name="plant", isolate=isolate)
     one = FmuInstance(setup_of(plant), [])
     y = np.zeros(1)
     one.bind(np.zeros(0), y)
