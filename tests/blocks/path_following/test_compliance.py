@@ -75,7 +75,7 @@ def equations(block, T, method="exact"):
 # --- sampled ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.drawn(6)
+@pytest.mark.drawn(2)
 @EVERY
 @EACH
 @pytest.mark.parametrize("method", ["exact", "semi_implicit"])

@@ -365,7 +365,7 @@ def test_the_arm_of_these_tests_obeys_lagrange():
 # --- exact linearization ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 @MODEL
 @EVERY
 def test_the_linearization_is_exact(kind, model):
@@ -411,7 +411,7 @@ def test_a_linearization_needs_a_model():
 # --- the coordinate transform, its inverse and its derivatives --------------------------------------------------------
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 @EVERY
 def test_path_coordinates_are_those_of_the_definition(kind):
     # eta_1 to 1e-12 (the arc length's accuracy); rates at speeds of 1 m/s and q > 0.4 to rounding
@@ -475,7 +475,7 @@ def test_all_derivatives_of_the_transform_are_those_of_the_definition(kind):
         assert abs(np.linalg.det(got)) == pytest.approx(1 / q**2, rel=1e-9)  # notes, paragraph 2
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 @EVERY
 def test_the_inverse_transform_is_the_inverse_by_the_definition(kind):
     path, rng = PATHS[kind], np.random.default_rng(8)
@@ -556,7 +556,7 @@ def tracked(source, path, **options):
 
 @pytest.mark.parametrize("direction", [1.0, -1.0], ids=["forth", "back"])
 @pytest.mark.parametrize("kind", CLOSED)
-@pytest.mark.drawn(5)
+@pytest.mark.drawn(3)
 def test_laps_are_counted(kind, direction):
     # three laps and a half at half the reach, 0.7 s a lap: the arc length is lifted with the parameter
     path = PATHS[kind]

@@ -572,7 +572,7 @@ def test_newton_converges_quadratically_to_the_foot_point(path):
 # --- traced as in NumPy -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 @EVERY
 def test_every_traced_equation_agrees_with_numpy(path):
     equations = {
@@ -595,6 +595,7 @@ def test_every_traced_equation_agrees_with_numpy(path):
                 np.testing.assert_allclose(value, wanted, rtol=1e-11, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.drawn(6)
 @EVERY
 def test_arrays_of_parameters_give_columns(path):
     theta = parameters(path, 9)

@@ -46,7 +46,7 @@ def by_steps(t, delay=1.0):
 @pytest.mark.parametrize(
     "solver", ["auto", "RK23", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams", "rk4"]
 )
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 def test_delayed_feedback_is_the_method_of_steps(solver):
     slow, machine, code = forms(delayed_feedback(), 6.0, step=0.01, solver=solver, rtol=1e-7, atol=1e-9)
     for run in (machine, code):

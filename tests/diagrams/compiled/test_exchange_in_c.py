@@ -94,7 +94,7 @@ def same(interpreted, compiled, rtol=1e-8, atol=1e-10):
 
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("solver", ["auto", "RK23", "DOP853", "Radau", "rk4"])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_a_plant_under_a_sampled_controller_is_that_of_the_matrix_exponential(files, fmi, solver):
     run = pi_loop(mass(files, fmi)).simulate(
         0.3, compile=True, solver=solver, step=T if solver == "rk4" else None, rtol=1e-9, atol=1e-12, progress=False

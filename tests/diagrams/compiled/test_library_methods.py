@@ -128,6 +128,7 @@ def test_pulses_are_landed_on_from_the_left_and_go_on_from_the_right(solver):
     assert np.max(np.abs(run["sum.y"] - (0.03 * whole + np.minimum(part, 0.03)))) < 1e-11
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("solver", METHODS)
 def test_a_second_run_of_the_same_simulation_has_the_same_bits(solver):
     made = driven_lags()
@@ -160,7 +161,7 @@ def failures(made, duration, **options):
 
 
 @pytest.mark.parametrize("solver", METHODS)
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_growth_beyond_all_bounds_says_the_same_and_keeps_the_same(solver):
     x = Integrator(name="x", initial_value=1.0)
     error = failures(Diagram("d", x(Function(lambda x: x**2, name="square")(x.y))), 2.0, step=0.01, solver=solver)
@@ -194,7 +195,7 @@ def test_an_error_of_a_python_function_is_that_of_the_run(solver):
 
 @pytest.mark.parametrize("solver", METHODS)
 @pytest.mark.parametrize("place", ["rates", "between"])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_ctrl_c_ends_it_and_keeps_what_was_recorded(solver, place):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     seen = []

@@ -491,7 +491,7 @@ def chain(file, *more, isolate=None, fault=None):
 
 @pytest.mark.parametrize("isolate", [True, False])
 @pytest.mark.parametrize("coupling", SCHEMES, ids=NAMES)
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_coupled_plants_step_in_c_s_loop(folder, coupling, isolate):
     """Ticks are at 0, 5, 15, 25, … ms and the end. b gets a of the step's end, or the mean of both ends.
 

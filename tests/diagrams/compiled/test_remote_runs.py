@@ -134,7 +134,7 @@ FAULTS = [
 @pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside"])
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_a_fault_is_told_as_in_an_interpreted_run(folder, fault, fmi, beside):
     file = zoo_fmu(folder, fmi, f"{fault} 0.05")
     isolate = SHORT if "hang" in fault else Isolation(memory=200e6) if "memory" in fault else True

@@ -176,7 +176,7 @@ ENVIRONMENTS = (
 
 @SIDE
 @pytest.mark.parametrize("name", [*VARIANTS, *OTHERS])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_growth_and_admittance_are_those_of_the_reduction_by_hand(side, name):
     model = loop(side, **{**VARIANTS, **OTHERS}[name])
     for environment in ENVIRONMENTS:

@@ -78,7 +78,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_the_environments_force_takes_the_way_of_the_force_on_the_plant(case):
     options, expected, entry = CASES[case]
     here = diagram(**options).contact("cart.push", force="felt", direction=[1.0], **PORTS)

@@ -47,6 +47,7 @@ def test_a_matched_continuous_loop_renders_the_target(side, plant, implementatio
     np.testing.assert_allclose(rendered_admittance(model, OMEGA), target_admittance(model, OMEGA), rtol=1e-11)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(("side", "factor"), [("par", 1.0 + 0.025 / 0.075), ("perp", 1.0)])
 def test_off_the_path_motion_along_it_is_rendered_q_times_as_fast(side, factor):
     # E22: at theta = 0 the curvature is 1/0.075 m; outside by 25 mm q = 4/3, m, d and k appear divided by it
@@ -68,7 +69,7 @@ def test_without_feed_forward_the_inner_loop_shows(side):
 
 @SIDE
 @pytest.mark.parametrize("share", [0.0, 0.5, 36.87])
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 def test_force_that_is_not_cancelled_moves_the_error_dynamics(side, share):
     # M (p̈ − ë) = … − M (a2 ṗ_e + …) + (1 − β) F: what is left of F meets the stiffness of the error dynamics
     model = loop(side, implementation="continuous", cancelled=share)
@@ -117,7 +118,7 @@ def test_the_response_is_an_object_of_python_control():
 @SIDE
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize("method", ["exact", "semi_implicit"])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_sampling_costs_the_first_order_in_the_sample_time(side, delay, method):
     omega = np.geomspace(0.1, 60.0, 20)
     target = target_admittance(loop(side), omega)
@@ -230,6 +231,7 @@ def test_the_intervals_are_where_the_real_part_is_negative():
         assert (rendered_admittance(loop("par", delay=1), omega).real < 0.0) is np.bool_(negative)
 
 
+@pytest.mark.slow
 def test_off_the_path_the_caveat_names_the_conjugate_force():
     circle = Circle(radius=0.2)
     assert "q F∥" in passivity(loop("par", SMOOTH, path=circle, eta=0.0, xi=0.02)).caveat

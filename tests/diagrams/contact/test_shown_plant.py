@@ -261,6 +261,7 @@ def test_other_coordinates_are_the_plants_own_matter():
     assert AdmittanceLoop.of(made, "par", eta=0.2, xi=0.01) == AdmittanceLoop.of(diagram(), "par", eta=0.2, xi=0.01)
 
 
+@pytest.mark.slow
 def test_differences_show_a_plant_within_their_stated_error(tmp_path, monkeypatch):
     made = experiments.compliance(plant=undirected(gantry.build(), tmp_path)).diagram
     assert made["plant"].linear_model().how.startswith("differences")

@@ -99,6 +99,7 @@ def test_blocks_in_continuous_time_and_other_fmus_are_passed_through(cache, step
     assert len(steps) == 2 * (10 + 4 - 2)  # both at the ticks of both subsystems
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(("options", "h"), [({}, 0.002), ({"step": 0.001}, 0.001)], ids=["own", "asked"])
 def test_run_and_linear_model_step_an_fmu_at_the_same_ticks(cache, steps, options, h):
     """The base of 2 ms and 3 ms is 1 ms; a ``step`` of 1 ms asks for communication points at all ticks."""

@@ -63,7 +63,7 @@ def test_two_masses_converge_with_the_order_of_the_scheme(cache, scheme, order):
 
 
 @pytest.mark.parametrize(("scheme", "order"), ORDERS)
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_blocks_in_continuous_time_take_part(cache, scheme, order):
     signals = ("a.position", "filter.y")
     errors = [
@@ -394,7 +394,7 @@ def test_a_stop_condition_between_two_ticks_ends_the_run_in_any_coupling(cache, 
     assert run.t[-1] == run.stopped.t
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "order"), ORDERS[::-1])
 def test_a_transport_delay_between_two_fmus_keeps_the_order(cache, scheme, order):
     """The second mass feels the first one, which nothing drives, 0.1 s later."""

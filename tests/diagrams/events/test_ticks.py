@@ -33,7 +33,7 @@ def ramp(name="x"):
 @pytest.mark.parametrize("solver", ["auto", "DOP853", "BDF", "rk4"])
 @pytest.mark.parametrize("relation", [">", ">="])
 @pytest.mark.parametrize("source", [ramp, lambda: Clock(name="clock").y])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_a_threshold_that_is_reached_at_a_tick_is_seen_at_that_tick(solver, relation, source):
     """x = t reaches 0.1 k at tick k, up to rounding of x, of k/10 and of 0.1 k."""
     for k in range(1, 20):

@@ -57,6 +57,7 @@ def test_a_pi_controller_has_the_numbers_of_the_closed_form(pi_spec):
     assert np.any(single != found)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     "name",
     [
@@ -380,7 +381,7 @@ int main(void) {{
 """
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [solved, between])
 def test_with_the_loop_of_runs_it_has_the_bits_of_rk4(make, tmp_path):
     diagram = make()
@@ -501,6 +502,7 @@ OUTSIDE = {"no source": ("clock", "pulses"), "one source": ("pulses",), "two sou
 QUICK = (("slow, then fast", "one source"), ("ticks without any", "two sources"), ("three", "no source"))
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     ("rates", "inside"),
     [

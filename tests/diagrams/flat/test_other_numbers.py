@@ -61,6 +61,7 @@ def assert_equal_runs(first, second):
     assert list(first.events) == list(second.events)
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("options", [{}, {"solver": "rk4", "step": 0.01}, {"compile": True}], ids=str)
 def test_runs_with_events_and_jumps_are_those_of_a_diagram_that_was_made_anew(options):
     diagram = thermostat()
@@ -124,6 +125,7 @@ def test_a_replaced_diagram_shares_functions_where_numbers_alone_differ():
     assert L.tobytes() == anew.tobytes()
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize(
     "change",
     [

@@ -272,6 +272,7 @@ def test_the_outputs_of_a_split_diagram_are_those_of_its_matrices(paths):
         assert ok == 1.0
 
 
+@pytest.mark.drawn(5)
 @pytest.mark.parametrize("paths", [*CHOICES, ("watch",), ("p", "watch")], ids="+".join)
 def test_indicators_and_jumps_of_a_split_diagram_are_those_of_the_traced_one(paths):
     traced = loop(Watch(name="watch")).flatten(1)
@@ -391,6 +392,7 @@ def test_a_solver_runs_through_opaque_stages(paths):
     np.testing.assert_allclose(end.y[:, -1], exact, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.drawn(4)
 @choices
 def test_linear_models_go_through_opaque_stages(paths):
     diagram = loop()
@@ -453,6 +455,7 @@ def test_a_tick_goes_through_a_sampled_block_from_outside():
     assert ok == 1.0
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("make", [experiments.path_following, experiments.hand_guiding])
 def test_the_papers_diagram_with_all_its_blocks_outside_is_the_same_function(make):
     experiment = make()

@@ -165,7 +165,7 @@ def roots(function, w):
     return np.array([brentq(lambda x: function(np.array([x]))[0], w[k], w[k + 1], xtol=1e-15, rtol=1e-14) for k in at])
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("make", LOOPS, ids=lambda f: f.__name__)
 def test_margins_are_those_of_the_closed_form(make):
     diagram, L, (low, middle, high) = make()
@@ -205,7 +205,7 @@ def test_roots_of_a_delayed_integrator_are_those_of_lamberts_w(k):
 
 
 @pytest.mark.parametrize(("k", "count"), [(0.9, 1), (1.1, 0), (3.2, 0), (6.0, 2), (40.0, 4)])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_the_count_includes_the_poles_of_the_loop_itself(k, count):
     """(s − 1) + k e^(−0.3 s), whose roots mpmath finds: the plant alone is unstable."""
     plant = rational([1.0], [1.0, -1.0], "plant")
@@ -308,6 +308,7 @@ def test_disk_margin_and_encirclements_take_loops_with_delays():
     assert nyquist_count(plant.linearize().loop("u")).encirclements == -1
 
 
+@pytest.mark.slow
 def test_sensitivities_of_a_loop_with_dead_time_are_those_of_its_closed_form():
     """K e^(−τ s)/s: the phase margin in degrees is 90 − K τ 180/π, the gain margin π/(2 K τ)."""
     diagram, _, _ = integrating()
@@ -516,6 +517,7 @@ def test_a_dead_time_that_is_long_beside_a_sensor_has_its_margin(sensor):
     assert found.phase_margin_deg.value == pytest.approx(exact, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_pade_of_a_sampled_diagram_is_refused():
     plant, late = rational([2.0], [5.0, 1.0], "lag"), delay(1.0)
 
@@ -622,6 +624,7 @@ def test_a_predictor_whose_model_is_exact_has_margins_ahead_of_its_model_in_no_t
     assert sum(calls) < 2_000_000
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("gain", [0.5, 0.8, 2.0])
 def test_a_gain_around_a_dead_time_has_the_margins_of_a_circle(gain):
     """L = k e^(−s): |L| is k, and −1 is passed at odd multiples of π with the factor 1/k; above 1 nothing is stable."""

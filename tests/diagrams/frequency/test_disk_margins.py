@@ -173,6 +173,7 @@ def test_three_channels_lie_between_a_perturbation_and_any_scaling(seed):
     assert lower == pytest.approx(bound, rel=1e-5)  # exact up to three channels
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("n", [2, 3])
 def test_nothing_destabilizes_where_nothing_is_fed_back(n):
     assert disk.mu_bound(np.zeros((n, n))) == disk.mu_lower_bound(np.zeros((n, n)))[0] == 0.0
@@ -249,6 +250,7 @@ def test_the_delayed_hold_is_what_simulation_between_the_ticks_gives(fraction):
     assert np.array(found) == pytest.approx(np.array(seen), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_whole_samples_of_delayed_hold_are_the_delay_of_the_loop():
     p, T = 20.0, 1e-3
     for n in (0, 1, 4):
@@ -258,6 +260,7 @@ def test_whole_samples_of_delayed_hold_are_the_delay_of_the_loop():
         )
 
 
+@pytest.mark.slow
 def test_a_delay_between_the_ticks_is_borne_a_little_differently_than_the_response_says():
     p, T = 20.0, 1e-3
     exact = delayed_hold_margin(AXIS, controller(p, T))

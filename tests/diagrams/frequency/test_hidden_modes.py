@@ -73,6 +73,7 @@ def test_hidden_unstable_modes_count_in_the_open_and_in_the_closed_loop(dt, pole
         assert sorted(np.real(count.hidden_unstable)) == pytest.approx(beyond, rel=1e-9)
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("way", WAYS)
 def test_lags_that_differ_by_rounding_alone_count_as_equal_ones(way):
     for apart in (0.0, 1e-15, 1e-13, 1e-12):

@@ -101,6 +101,7 @@ def test_nyquist_is_the_closed_form_with_its_mirror_and_crossings_in_view(loop):
     assert loop.nyquist(far).axes[0].get_xlim()[0] < -2.5
 
 
+@pytest.mark.slow
 def test_nichols_is_gain_over_phase(loop):
     w = np.geomspace(0.5, 50.0, 40)
     phase, gain = curve(loop.nichols(omega=w).axes[0])
@@ -143,6 +144,7 @@ def test_the_phase_is_on_the_branch_on_which_the_phase_margin_is_read(name):
         assert margin == pytest.approx(phase(omega) + 180.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_phase_of_a_loop_with_dead_time():
     level = Integrator(name="level")
     pipe = TransportDelay(delay=DELAY, name="pipe")
@@ -181,6 +183,7 @@ def test_margins_are_marked_in_all_three_diagrams():
     assert not plain.get_title(loc="right")
 
 
+@pytest.mark.slow
 def test_a_step_is_that_of_the_closed_loop(loop, sampled):
     axes = loop.step(sampled, t=3.0).axes[0]
     C, P = control.tf([KP, KI], [1.0, 0.0]), control.tf([1.0], [TAU, 1.0, 0.0])
@@ -192,6 +195,7 @@ def test_a_step_is_that_of_the_closed_loop(loop, sampled):
     assert loop.step().axes[0].get_xlim()[1] == pytest.approx(30 / 4.9, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_gang_of_four_is_that_of_plant_and_controller(loop):
     w = np.geomspace(0.1, 100.0, 30)
     figure = loop.gang_of_four("y", omega=w)
@@ -203,6 +207,7 @@ def test_the_gang_of_four_is_that_of_plant_and_controller(loop):
         assert np.allclose(curve(axes)[1], np.abs(expected[axes.get_ylabel()]), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_several_loops_and_measured_data_stand_in_one_figure(loop):
     C, P = exact(np.array([1.0, 10.0]))
     data = control.frd(C * P, np.array([1.0, 10.0]), name="measured")
@@ -222,6 +227,7 @@ def test_several_loops_and_measured_data_stand_in_one_figure(loop):
     assert [text.get_text() for text in own] == ["a", "b"]
 
 
+@pytest.mark.slow
 def test_each_figure_is_one_of_pyplots(loop):
     import matplotlib.pyplot as plt
 
@@ -315,6 +321,7 @@ def test_interconnected_systems_of_several_signals_in_any_sample_time_come_in_an
     np.testing.assert_allclose(back(1j), closed(1j), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_resonances_are_drawn_to_their_peaks_and_legends_stand_above(loop):
     """|1/(s² + 2 ζ s + 1)| is 1/(2 ζ √(1 − ζ²)) at its peak."""
     damping = 1e-3
@@ -328,7 +335,7 @@ def test_resonances_are_drawn_to_their_peaks_and_legends_stand_above(loop):
 
 
 @pytest.mark.parametrize("end", [0.6, 1.2, 1.4])  # divided by 0.2 s, they are just below a whole number
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_a_sampled_step_response_has_its_last_sample(end):
     figure = drive(0.2).replace({"pi.numerator": [1.0, 0.5]}).linearize().loop("u").step(t=end)
     assert figure.axes[0].lines[0].get_xdata()[-1] == pytest.approx(end, rel=1e-12)
@@ -354,6 +361,7 @@ def test_frequencies_that_all_lie_beyond_a_sampled_loop_are_refused(sampled, kin
         getattr(sampled, kind)(omega=[200.0, 1000.0])
 
 
+@pytest.mark.slow
 def test_a_sampled_loop_is_drawn_up_to_half_its_sampling_frequency_with_the_crossovers_of_its_title(sampled):
     """A fast pole puts ω_180 84 times above ω_c: the curve reaches it, and π/T, and the margin is marked."""
     lag = TransferFunction(numerator=[0.8], denominator=[0.026, 1.0], name="lag")

@@ -63,7 +63,7 @@ def test_a_gain_divides_the_gain_margin_of_a_sampled_integrator():
 
 
 @pytest.mark.parametrize(("T", "delay", "skew"), [(0.0, 0, 0.3), (0.05, 0, 0.0), (0.05, 2, -0.5)])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_slopes_are_the_differences_of_margins(T, delay, skew):
     matrices = hold(T) if T else (A, B, C, np.zeros((1, 1)))
     changes = make_changes(matrices, 3)

@@ -96,7 +96,7 @@ def model():
 
 
 @pytest.mark.parametrize("wire", ["voltage", "reference"])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_gain_phase_and_delay_margins_are_the_limits_of_the_period_gone_through_by_hand(model, wire):
     L = model.loop(wire, lifted=True)
     found = periodic_margins(L)
@@ -138,6 +138,7 @@ def test_the_disk_margin_is_the_smallest_disk_that_destabilizes_the_period_gone_
     assert np.min(np.minimum(np.abs(nearest - z), np.abs(nearest - z.conj()))) < 1e-5
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     ("wire", "frozen", "dt"), [("voltage", ("angle", "speed"), FAST), ("reference", ("angle",), MIDDLE)]
 )

@@ -249,7 +249,7 @@ def test_margins_that_are_there_are_compared_without_a_second_reduction(monkeypa
 
 @pytest.mark.parametrize("damping", [0.05, 0.003])
 @pytest.mark.parametrize("period", [0.0, 0.1])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_its_disk_margin_is_asked_for_at_the_frequencies_where_it_is_least(damping, period):
     """An integrator before a resonance: a peak as wide as the damping is asked for where it is, and the tools agree."""
     loop = control.ss(control.tf([1.8 * damping], [1, 0]) * control.tf([1], [1, 2 * damping, 1]))

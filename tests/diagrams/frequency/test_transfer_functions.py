@@ -106,7 +106,7 @@ def test_an_equation_without_a_solution_is_an_error_with_a_next_step(monkeypatch
         margins(control.tf([1.0], [1.0, 1.0]))
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.01, 0.3])
 @pytest.mark.parametrize("samples", [1, 14, 15, 16, 23, *(pytest.param(n, marks=pytest.mark.slow) for n in (40, 60))])
 def test_a_delay_written_into_the_polynomials_has_the_margins_of_its_closed_form(samples, gain):

@@ -79,7 +79,7 @@ def model_around_the_mass():
 
 
 @pytest.mark.parametrize(("interface", "exact"), WAYS)
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_a_sampled_loop_around_an_fmu_at_rest(monkeypatch, interface, exact):
     bound = forced(monkeypatch, interface, exact)
     lin = around_the_mass(mass(position=0.0)).linearize(inputs="u", outputs="u")
@@ -111,6 +111,7 @@ def test_on_the_move_the_step_itself_is_differenced(at):
         assert run.save().w[:2] - before[:2] == pytest.approx(lin.affine[1:3], rel=1e-8)
 
 
+@pytest.mark.slow
 def test_the_loop_of_an_fmu_is_closed_again_wherever_it_is_cut():
     lin = around_the_mass(mass(position=0.0)).linearize()
     want = np.poly(lin.A)
@@ -402,6 +403,7 @@ def test_friction_that_the_controller_does_not_know_couples_and_damps():
     assert np.abs(poles).max() > 180  # against 40
 
 
+@pytest.mark.slow
 def test_the_start_has_the_tool_as_every_later_tick():
     diagram = at_rest(tool_mass=2.0)
     first, later = diagram.linearize(), diagram.linearize(T)

@@ -266,6 +266,7 @@ def test_a_shift_has_to_be_answered_alike_at_every_point(block, found):
     assert states_of(Diagram("d", angle(motor(controller(angle.y, motor.y)))), at=0.02) == found
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("rates", [(1e-2, 1e-2), (1e-2, 1e-3)], ids=["one rate", "two rates"])
 def test_an_encoder_that_only_shows_an_angle_moves_with_it(rates):
     @subsystem(sample_time=rates[1])
@@ -328,7 +329,7 @@ def fmu_drive(**options):
 
 @pytest.mark.parametrize("at", [0.0, 0.4], ids=["standing", "running"])
 @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_the_angle_of_a_motor_that_is_an_fmu_is_free(interface, at):
     model = fmu_drive(interface=interface).linearize(at)
     free = model.free_motions()
@@ -338,6 +339,7 @@ def test_the_angle_of_a_motor_that_is_an_fmu_is_free(interface, at):
     assert len(model.poles_without(free)) == len(model.poles) - 1
 
 
+@pytest.mark.slow
 def test_an_fmu_whose_states_can_not_be_shifted_is_judged_by_its_linear_model_and_says_so(monkeypatch):
     def refuse(block, **how):
         raise FmuError("its state has no exact start value")
@@ -395,7 +397,7 @@ def test_a_cart_under_a_pendulum_without_position_feedback_is_a_ramp():
     ids=str,
 )
 @pytest.mark.parametrize("sample_time", [None, T, Fraction(3, 2)], ids=["continuous", "sampled", "at 2π/T"])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_hidden_states_count_as_ever(sample_time, hidden):
     plant = Hidden(**hidden, name="plant")
     gain = control(lambda y: Gain(gain=-0.2, name="gain")(y), sample_time)
@@ -410,6 +412,7 @@ def test_hidden_states_count_as_ever(sample_time, hidden):
     assert len(left) == 3
 
 
+@pytest.mark.slow
 def test_a_discrete_oscillation_over_the_whole_period_is_not_free():
     # a rotation by 2π/10 a tick of 1 ms, in a period of 10 ms: z = 1 over the period
     c, s = np.cos(0.2 * np.pi), np.sin(0.2 * np.pi)

@@ -57,6 +57,7 @@ def test_an_fmu_that_stays_is_at_rest_and_says_that_its_states_are_not_judged(ca
     assert make(step, u).operating_point(0.01, step=0.01).unjudged == ("plant",)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("step", ["c->y + h * (c->u - c->y)", "c->y"], ids=["lag", "constant"])
 def test_targets_that_hidden_states_keep_away_name_them_and_a_run(cache, make, step):
     """y = 2 has a rest at u = 2 for the lag, which one step from y = 0 doesn't show: u would have to be 2000."""

@@ -93,7 +93,7 @@ def test_a_model_along_a_motion_is_as_exact_as_the_derivatives_and_takes_no_more
 
 
 @pytest.mark.parametrize("interface", WAYS)
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_margins_of_a_loop_with_a_hidden_integrator_are_those_of_exact_derivatives(file3, interface):
     exact = margins(sampled(file3, interface).linearize().loop("u"))
     assert exact.findings == ()
@@ -106,7 +106,7 @@ def test_margins_of_a_loop_with_a_hidden_integrator_are_those_of_exact_derivativ
 
 
 @pytest.mark.parametrize("interface", WAYS)
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_a_diagram_says_that_derivatives_are_wrong_and_does_not_use_them(file3, interface):
     wrong, right = (sampled(file3, interface, e=e).linearize() for e in (-2.0, 0.0))
     np.testing.assert_allclose(wrong.A, right.A, atol=1e-8)
@@ -125,7 +125,7 @@ def test_a_trim_and_a_stiff_run_do_not_depend_on_wrong_derivatives(file3):
 
 @pytest.mark.parametrize("interface", WAYS)
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_local_variables_as_ports_have_slopes_though_the_fmu_may_not_be_asked_for_them(tmp_path, fmi, interface):
     file = misstated_fmu(tmp_path, fmi, hides_state=True)
     plant = Fmu(file, interface=interface, ports=["u", "v", "x", "w"], name="plant")
@@ -178,7 +178,7 @@ ROUGH = (("return -100.0 * x - v + c->u; }", "return single(single(101325.0 - 10
 
 
 @pytest.mark.parametrize("interface", WAYS)
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_numbers_that_rest_on_derivatives_of_unknown_error_have_an_unknown_tolerance(tmp_path, interface):
     single = "static double single(double v) { volatile float s = (float)v; return s; }\nstatic double rate("
     file = misstated_fmu(tmp_path, 3, (*ROUGH, ("static double rate(", single)))

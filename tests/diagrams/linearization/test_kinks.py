@@ -73,6 +73,7 @@ KINKS = {
 }
 
 
+@pytest.mark.drawn(5)
 @pytest.mark.parametrize("case", KINKS)
 def test_the_slopes_to_both_sides_are_found_where_they_differ(case):
     block, u, below, above = KINKS[case]
@@ -414,6 +415,7 @@ FLAT = {
 }
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("case", FLAT)
 def test_a_loop_without_a_slope_names_the_block_and_the_argument(case):
     block, argument = FLAT[case]

@@ -116,6 +116,7 @@ def test_a_source_that_jumps_within_the_period_is_followed():
     close(lin.A, differences(go, np.array([0.5]), 1e-3), 1e-9)
 
 
+@pytest.mark.slow
 def test_a_bent_algebraic_loop_is_solved_all_along_the_period():
     """ẋ = −2 v + u, v = 0.5 sin v + x², u held."""
     x = Integrator(initial_value=1.2)
@@ -252,6 +253,7 @@ def hybrid():
     return Diagram("hybrid", plant(controller(plant.y.named("y")).named("force")))
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("wire", ["u", "y"])
 def test_sensitivities_belong_to_the_loop(wire):
     lin = hybrid().linearize()

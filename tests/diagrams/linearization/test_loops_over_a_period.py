@@ -68,6 +68,7 @@ def test_an_offset_of_the_only_clock_does_not_change_the_loop(phase, wire):
         assert model.complementary(wire)(z) == pytest.approx(L(z) / (1.0 + L(z)), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_the_gain_margin_with_an_offset_is_where_the_diagram_becomes_unstable():
     found = margins(offset(0.03).linearize().loop("u")).gain_margin_high.value
     assert found == pytest.approx(limit(lambda k: offset(0.03, k)), rel=1e-9)

@@ -85,6 +85,7 @@ def test_an_equilibrium_follows_its_reference(sample_time):
     assert not found["r.value"].rest_lost
 
 
+@pytest.mark.slow
 def test_a_point_that_is_found_anew_gives_the_slopes_of_the_equilibrium():
     diagram = make_tank()
     model = diagram.linearize(diagram.trim())

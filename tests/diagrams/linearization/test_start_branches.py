@@ -52,7 +52,7 @@ def phase_margin():
 
 
 @pytest.mark.parametrize("start", [(0.0, 0.0), (0.3, 0.0), (0.3, 0.2)])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_the_speed_of_an_encoder_is_fed_back_in_the_model_of_the_start(start):
     diagram = servo(*start)
     for point in (None, 0.0, diagram.operating_point(0.0), diagram.operating_point(states={"angle.y": 0.7})):

@@ -122,6 +122,7 @@ class Capillary(Block):
         return u.inflow - self.conductance * self.diameter**4 * x.volume
 
 
+@pytest.mark.slow
 def test_a_parameter_of_an_fmu_far_below_1_in_its_unit_is_found():
     plant = Fmu(build(Capillary()), name="plant")
     diagram = Diagram("vessel", plant(inflow=Constant(value=0.5, unit="m3/s", name="q")))
@@ -129,6 +130,7 @@ def test_a_parameter_of_an_fmu_far_below_1_in_its_unit_is_found():
     assert point.parameters["plant.start.diameter"] == pytest.approx((0.5 / (1e23 * 2.0)) ** 0.25, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_fig3_at_rest_at_a_point_off_the_path_stays_there():
     diagram = fig3_at_rest(xi=0.03)
     point = diagram.trim()
@@ -197,6 +199,7 @@ def delayed(initial_value=0.0):
     return Diagram("delayed", tank(pipe(controller(Constant(value=0.6), flow)) - flow))
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("initial_value", [0.0, 0.5, None])
 def test_a_dead_time_at_rest_puts_out_its_input(initial_value):
     """Whatever it holds at the start: the search wanted it to put out 0, and no such loop had an operating point."""

@@ -37,7 +37,7 @@ def test_a_continuous_diagram_answers_a_step_at_any_time(t, length):
 
 @pytest.mark.parametrize("t", [1000.0, 0.37])
 @pytest.mark.parametrize("how", ["time", "point", "instant"])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_a_continuous_diagram_is_measured_at_any_time(t, how):
     diagram = lag_loop()
     given = {"time": lambda: t, "point": lambda: diagram.operating_point(t), "instant": lambda: _instant(diagram, t)}
@@ -104,6 +104,7 @@ def hidden_state_answer(samples):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_a_plant_whose_states_cannot_be_set_is_run_to_the_point(tmp_path):
     diagram = hidden_state_loop(tmp_path)
     for at in (2.0, diagram.operating_point(2.0)):
@@ -124,6 +125,7 @@ def test_a_point_that_a_repeated_run_does_not_reach_is_refused(tmp_path):
         step_response(diagram.wired, "u", size=0.1, length=1.0, at=point)
 
 
+@pytest.mark.slow
 def test_a_report_at_a_trimmed_point_injects_there():
     """At its start a sampled cubic law is 2 off its rest, with four times the slope."""
     plant = Integrator(name="plant")

@@ -66,6 +66,7 @@ def test_a_continuous_loop_has_its_closed_form():
     assert found.moved <= 1e-6
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("kind", ["sine", "multisine", "chirp"])
 def test_a_sampled_loop_has_its_closed_form(kind):
     """x⁺ = 0.9 x − 0.3 x: L = 0.3/(z − 0.9)."""

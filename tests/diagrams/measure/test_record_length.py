@@ -87,7 +87,7 @@ class NoisyWindows(Windows):
 
 
 @pytest.mark.parametrize("deviation", [1e-4, 1e-2])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_the_noise_in_an_uncertainty_covers_the_true_value_in_its_share_of_draws(deviation):
     """The share is 95 %, of v; that of L is more, as the errors of v and u add up, which are one noise."""
     (part,) = plan_signal("sine", np.array([20.0]), 0.01, 1.0)

@@ -50,6 +50,7 @@ def test_a_continuous_loop_answers_as_its_complementary_sensitivity():
     np.testing.assert_allclose(found.answer(True), y, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_final_value_is_that_of_the_linear_model_at_frequency_zero():
     found = step_response(spring().wired, "u", size=0.1, length=0.2, outputs=["place.y", "speed.y"])
     np.testing.assert_allclose(found.final / 0.1, [-1.0, 1 / 40, 0.0], atol=1e-9)
@@ -71,6 +72,7 @@ def test_a_continuous_diagram_is_tried_at_the_point_that_was_trimmed():
     assert measured.L.frdata.item() == pytest.approx(complex(L(1j * measured.omega[0])), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_point_at_the_start_is_the_start():
     """Its step of 1 ms made a sine of 0.5 rad/s 16 times as long to run as one from the start."""
     diagram = spring()
@@ -122,6 +124,7 @@ def test_a_response_that_ends_off_its_target_never_settles():
     )
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("delay", [0, 1])
 def test_a_sampled_loop_is_its_recurrence(delay):
     found = step_response(sampled(delay=delay).wired, "controller.u", size=0.1, length=2.0, outputs=["lag.y"])
@@ -262,7 +265,7 @@ def test_with_the_linear_model_beside_it_a_slow_tail_costs_no_accuracy():
 
 
 @pytest.mark.parametrize("samples", [20, 50, 1000])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_what_lies_between_the_samples_is_in_the_tolerance_of_a_peak(samples):
     """The answer of T = (3 s + 40)/(s² + 3 s + 40) has its peak where its slope is zero."""
     s = control.tf("s")

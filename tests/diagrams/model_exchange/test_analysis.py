@@ -61,6 +61,7 @@ def test_a_sampled_loop_has_the_discrete_model_of_its_matrices(file):
     np.testing.assert_allclose(found, np.sort_complex(np.linalg.eigvals(closed)), rtol=1e-9)
 
 
+@pytest.mark.drawn(1)
 def test_a_trim_finds_the_states_by_name_and_a_run_stays_there(file):
     point = pushed(file).trim(free=["force.value"], targets={"plant.position": 0.5})
     assert point.parameters["force.value"] == pytest.approx(50.0, rel=1e-12)
@@ -71,6 +72,7 @@ def test_a_trim_finds_the_states_by_name_and_a_run_stays_there(file):
     assert fixed.x[0] == 0.3
 
 
+@pytest.mark.drawn(1)
 def test_a_run_goes_on_from_a_saved_state_and_branches(file):
     diagram = pushed(file)
     with diagram.simulation(step=0.1) as simulation:
@@ -113,7 +115,7 @@ def test_an_fmu_that_cannot_save_its_state_says_so(file, monkeypatch):
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_fig3_with_a_plant_in_model_exchange_is_fig3_with_the_plant_as_a_block(cache, tmp_path, fmi):
     path = gantry.build(out=tmp_path / "gantry.fmu", fmi=fmi)
     swapped = experiments.hand_guiding(plant=Fmu(path, interface="model_exchange")).diagram
@@ -188,7 +190,7 @@ def test_a_loop_has_its_slopes_by_the_parameters_of_its_controller(file):
     assert {"controller.pi.kp", "controller.pi.ki"}.isdisjoint(found.without_effect)
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_a_loop_has_its_slopes_by_parameters_of_the_fmu(file):
     plant = Fmu(file, interface="model_exchange", name="plant", start={"position": 0.0})
     force = PID(kp=20.0, ki=30.0, name="pi")(0.0, plant.position).named("u")

@@ -29,7 +29,7 @@ RADAU = pytest.param("Radau", marks=pytest.mark.one_tier)  # its output `steps` 
 
 
 @pytest.mark.parametrize("solver", ["RK45", RADAU, "BDF", "CVODE_Adams", "rk4", "euler"])
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 def test_a_solver_lands_on_time_events(file, solver):
     diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
     run = diagram.simulate(1.1, step=0.1, solver=solver, progress=False)
@@ -60,6 +60,7 @@ def test_an_input_that_is_no_integer_is_refused_with_the_way_to_convert_it(file)
     assert error.value.message.endswith("Convert the signal before this input, with Quantizer, say.")
 
 
+@pytest.mark.drawn(1)
 def test_a_sampled_integer_output_reaches_the_fmu_at_its_tick(file):
     @subsystem(sample_time=0.1)
     def sampler(x):
@@ -71,6 +72,7 @@ def test_a_sampled_integer_output_reaches_the_fmu_at_its_tick(file):
     np.testing.assert_array_equal(run["plant.m"], run["plant.n"] if "plant.n" in run else run["plant.m"])
 
 
+@pytest.mark.drawn(1)
 def test_a_jump_of_a_continuous_input_is_an_event(file):
     fmu = plant(file)
     quiet = Diagram("d", fmu(u=Constant(value=1.0, name="u"), n=Constant(value=0.0, name="n")))
@@ -79,6 +81,7 @@ def test_a_jump_of_a_continuous_input_is_an_event(file):
     assert events == [3.0, 4.0]  # at the start, at 0.25 and 0.5 s; and at 0.4 s
 
 
+@pytest.mark.drawn(1)
 def test_a_step_event_sets_states_and_nominal_values_anew(file):
     diagram = Diagram("d", plant(file, armed=1)(u=Constant(value=8.0, name="u"), n=Constant(value=0.0, name="n")))
     with diagram.simulation(step=0.05, solver="rk4") as simulation:
@@ -137,6 +140,7 @@ def test_it_refuses_to_stand_in_an_enabled_subsystem(file):
         Diagram("d", box(Constant(value=1.0), enable=Constant(value=1.0)).named("x"))
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
@@ -157,7 +161,7 @@ def test_a_failure_names_fmu_call_and_time_and_keeps_the_samples(cache, tmp_path
     assert error.value.run.t[-1] >= 0.2
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "CVODE_Adams", "rk4", "euler"])
 @pytest.mark.parametrize("duration", [0.7, 0.72])
 def test_no_solver_evaluates_beyond_the_end_of_the_run(cache, tmp_path, solver, duration):
@@ -169,6 +173,7 @@ def test_no_solver_evaluates_beyond_the_end_of_the_run(cache, tmp_path, solver, 
     np.testing.assert_allclose(run["plant.x"], exact(run.t, 0.5), atol=1e-12)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_time_events_that_pile_up_are_an_error(cache, tmp_path, fmi):
     file = eventful_fmu(tmp_path, fmi, following="c->t < 0.25 ? 0.25 : c->t + 1e-12")
@@ -181,6 +186,7 @@ def test_time_events_that_pile_up_are_an_error(cache, tmp_path, fmi):
     assert error.value.run.t[-1] == 0.2
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     ("tick", "refused"), [(1e-7, True), pytest.param(1.2e-9, False, marks=pytest.mark.slow), (1e-10, False)]
 )
@@ -207,6 +213,7 @@ def test_many_time_events_that_leave_the_run_its_way_are_none(cache, tmp_path):
         assert len(named(simulation.run().events, "time_event")) == pytest.approx(600, abs=7)
 
 
+@pytest.mark.slow
 def test_a_run_in_picoseconds_has_as_many_time_events_as_it_likes(cache, tmp_path):
     file = eventful_fmu(tmp_path, 3, following="c->t + 1e-12")
     diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
@@ -215,6 +222,7 @@ def test_a_run_in_picoseconds_has_as_many_time_events_as_it_likes(cache, tmp_pat
     assert run.t[-1] == 6e-10
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_a_next_event_time_that_is_no_number_is_an_error(cache, tmp_path, fmi):
     file = eventful_fmu(tmp_path, fmi, following="c->t < 0.25 ? 0.25 : 0.0 / 0.0")
@@ -224,6 +232,7 @@ def test_a_next_event_time_that_is_no_number_is_an_error(cache, tmp_path, fmi):
     assert error.value.run.t[-1] == 0.2
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_an_input_that_leaves_its_range_between_events_is_refused_at_the_step(tmp_path, cache, fmi, isolate):

@@ -41,13 +41,14 @@ def exact_motion(t):
 
 
 @pytest.mark.parametrize("solver", ["auto", "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams"])
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 def test_a_driven_mass_meets_its_equations_to_the_tolerance_of_each_solver(files, fmi, solver):
     diagram = driven(Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name="plant"))
     run = diagram.simulate(2.0, step=0.1, solver=solver, rtol=1e-8, atol=1e-11, progress=False)
     np.testing.assert_allclose(run["plant.position"], exact_motion(run.t), atol=2e-7)
 
 
+@pytest.mark.drawn(1)
 def test_fixed_steps_converge_by_their_order(files, fmi):
     diagram = driven(Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name="plant"))
     errors = []
@@ -76,6 +77,7 @@ def test_states_are_those_of_the_diagram(files, fmi):
     assert flat.in_model_exchange == ("plant",)
 
 
+@pytest.mark.drawn(1)
 def test_feedthrough_by_the_model_structure_orders_a_loop_around_the_fmu(files, fmi):
     plant = Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name="plant", start={"position": 0.1})
     feedback = Gain(gain=-5.0, name="feedback")(plant.position)  # no algebraic loop: the position has no feedthrough
@@ -88,6 +90,7 @@ def test_feedthrough_by_the_model_structure_orders_a_loop_around_the_fmu(files, 
     np.testing.assert_allclose(run["plant.position"], exact, atol=1e-8)
 
 
+@pytest.mark.drawn(1)
 def test_an_algebraic_loop_through_the_fmu_is_solved_or_told(files, fmi):
     def loop(**options):
         plant = Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name="plant", start={"position": 0.1})
@@ -107,6 +110,7 @@ def test_an_algebraic_loop_through_the_fmu_is_solved_or_told(files, fmi):
     np.testing.assert_allclose(run["plant.position"], exact, atol=1e-8)
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("solver", ["RK45", "rk4", "CVODE_Adams"])
 def test_a_ball_bounces_as_in_closed_form(files, fmi, solver):
     diagram = Diagram("ball", Fmu(files[bouncing_ball, fmi], interface="model_exchange", name="ball")())

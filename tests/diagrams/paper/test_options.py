@@ -124,6 +124,7 @@ def test_numbers_that_are_none(value):
         path_following(tool_mass=value)
 
 
+@pytest.mark.drawn(5)
 @pytest.mark.parametrize(
     ("value", "kept"),
     [
@@ -149,6 +150,7 @@ def test_limits_in_one_form(value, kept):
     assert ("controller.saturation" in experiment.diagram.blocks) == (kept is not None)
 
 
+@pytest.mark.slow
 def test_a_force_limit_on_one_axis_leaves_the_other_alone(runs):
     _, free = runs("A")
     _, run = runs("A", motor_force_limit=(300, math.inf))
@@ -159,6 +161,7 @@ def test_a_force_limit_on_one_axis_leaves_the_other_alone(runs):
     assert np.array_equal(same.data, run.data)
 
 
+@pytest.mark.slow
 def test_a_velocity_limit_on_one_direction_leaves_the_other_alone(runs):
     _, free = runs("B")
     _, run = runs("B", velocity_limit=(0.2, None))

@@ -36,7 +36,7 @@ def in_metres(run):
 
 
 @pytest.mark.parametrize("letter", "AD")
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 def test_an_experiment_places_a_plant_in_millimetres(file, letter):
     plant = Fmu(file, convert_units=True)
     experiment = experiments.EXPERIMENTS[letter](plant=plant)

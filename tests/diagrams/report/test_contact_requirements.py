@@ -48,7 +48,7 @@ def review(contact, contacts=None, **asked):
     return analyse(made, only=(), contacts=contacts, requirements=Requirements(contact=contact, **asked))
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     ("limit", "verdict", "distance"),
     [
@@ -82,6 +82,7 @@ def test_limits_without_contacts_are_not_decided_and_those_of_others_refused():
         review({"hnd": {"stiffness": 1.0}})
 
 
+@pytest.mark.slow
 def test_a_limit_that_a_run_contradicts_is_not_decided(monkeypatch):
     monkeypatch.setattr(confirmed_limits, "measure_growth", lambda *given: 3.0)
     (result,) = (r for r in review({"stiffness": 0.5 * SOFT}).review.results if r.quantity == "contact.stiffness")

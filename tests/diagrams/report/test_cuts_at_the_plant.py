@@ -73,6 +73,7 @@ def own():
     return OwnObserver(name="observer")
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("limited", [False, True])
 def test_a_report_cuts_at_the_plant_beside_an_observer_at_top_level(limited):
     """Behind the wire both ways are cut: 64° and M_s = 1, whatever the observer; at the plant 33° and 1.8."""
@@ -92,6 +93,7 @@ def test_a_worst_case_is_looked_for_at_the_plant_beside_an_observer():
     assert found.nominal[0].value == pytest.approx(control.stability_margins(BY_HAND)[1], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_verdict_is_open_where_an_observer_is_not_declared():
     """Its graph is that of two tanks in line, both fed by the wire: 33° at one, 64° for both."""
     diagram = with_observer(own)
@@ -109,6 +111,7 @@ def test_a_verdict_is_open_where_an_observer_is_not_declared():
         assert verdicts(decided)["phase_margin_deg"] == (verdict, Reason.COMPARED)
 
 
+@pytest.mark.slow
 def test_a_verdict_counts_where_all_cuts_have_it():
     report = observed(boxed=False).report(only=("inner",), requirements=Requirements(**ASKED))
     assert {verdict for verdict, _ in verdicts(report).values()} == {Verdict.PASSED}
@@ -126,6 +129,7 @@ def test_a_worst_case_says_what_other_cuts_have():
     assert f"{expected:.6g} at plant.u" in str(found)
 
 
+@pytest.mark.slow
 def test_a_worst_case_at_the_plants_input_is_one_of_the_diagram_that_was_given():
     diagram = with_observer(library)
     found = diagram.worst_case(
@@ -146,6 +150,7 @@ def predictor():
     return Diagram("predictor", plant(u), model(u))
 
 
+@pytest.mark.slow
 def test_a_verdict_is_open_beside_a_predictor_whose_blocks_are_side_by_side():
     s = control.tf("s")
     inner, lag = 8.0 / (5 * s + 1), 1 / (3 * s + 1)
@@ -208,7 +213,7 @@ def test_a_pi_law_of_single_blocks_is_decided():
     assert {verdict for verdict, _ in verdicts(report).values()} == {Verdict.PASSED}
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("wire", ["e", "y"])
 @pytest.mark.parametrize(("ms", "verdict"), [(2.6, Verdict.PASSED), (2.3, Verdict.FAILED)])
 def test_an_error_that_enters_a_sampled_pi_law_is_one_wire(wire, ms, verdict):

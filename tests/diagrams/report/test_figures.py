@@ -75,6 +75,7 @@ def test_a_variant_has_one_color_in_all_figures():
     assert delayed.looks["sampled_d0"]["color"] != BLUE
 
 
+@pytest.mark.slow
 def test_the_gang_of_four_is_drawn_where_the_whole_loop_goes_through_the_other_wire():
     assert (
         gang_of_four(Case(reviewed.drive().wired), "voltage", "controller.voltage") == ()
@@ -116,6 +117,7 @@ def check_layout(figure):
         assert box.x1 <= extent.x1 + 1
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("span", [(30.0, 450.0), (1.0, 1.9)])
 def test_ticks_of_frequencies_do_not_overlap(span):
     w = np.geomspace(*span, 50)
@@ -130,6 +132,7 @@ def plots_of(sections):
         yield from plots_of(section.sections)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "parts"),
     [
@@ -191,6 +194,7 @@ def test_a_block_that_is_defined_at_samples_has_no_continuous_variant_and_the_re
     assert "sample_time=" not in case.variants["continuous"].problem
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("in_a_grid", [True, False])
 def test_a_figure_is_laid_out_once_and_drawn_once(in_a_grid, monkeypatch):
     w = np.geomspace(1.0, 100.0, 9)

@@ -50,6 +50,7 @@ def stable_of(report):
     return found
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("sample_time", [None, 0.01], ids=["continuous", "sampled"])
 def test_a_drive_passes_and_its_angle_is_named_wherever_the_verdict_is(sample_time):
     report = analyse(

@@ -250,6 +250,7 @@ def test_the_same_report_is_the_same_page():
     assert to_html(report()) == to_html(report())
 
 
+@pytest.mark.slow
 def test_only_long_tables_go_over_pages():
     html = to_html(report(rows=60))
     assert html.count('class="table long"') == to_html(report()).count('class="table long"') + 1
@@ -259,6 +260,7 @@ def test_only_long_tables_go_over_pages():
 # --- drawings in it -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_large_diagram_is_shown_closed_and_box_by_box():
     tree = parsed(to_html(with_drawing(report(), experiments.compliance().diagram.wired)))
     captions = [text_of(c) for c in tree.iter("figcaption")]
@@ -370,6 +372,7 @@ def test_page_pdf_and_json_stand_beside_each_other(tmp_path):
     assert write_report(report(), None) == []
 
 
+@pytest.mark.slow
 def test_no_heading_and_no_head_of_a_table_stands_alone_at_the_end_of_a_page(tmp_path):
     for lines in range(20, 60, 3):
         text = ("Filling.",) * lines
@@ -417,6 +420,7 @@ def test_a_notebook_shows_the_page_in_a_frame():
     assert report()._repr_html_().startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
 
 
+@pytest.mark.slow
 def test_every_figure_has_its_caption_for_people_who_do_not_see_it():
     tree = parsed(to_html(with_drawing(report(), experiments.compliance().diagram.wired)))
     drawn = [svg for svg in tree.iter() if str(svg.tag).endswith("svg") and svg.get("role") == "img"]

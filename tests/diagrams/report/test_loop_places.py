@@ -74,6 +74,7 @@ def test_the_step_of_a_predictor_is_added_at_the_plants_input():
     assert measured.value == pytest.approx(linear.value, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_worst_case_is_looked_for_at_the_place_that_is_required():
     by_hand = peak(smith_by_hand(gain=1.5)[0](Z))
     asked = Requirements(loops={"u": {"ms": 1.7, "to": "plant.u"}})

@@ -118,6 +118,7 @@ def test_a_sound_model_and_a_machine_that_is_not_fail_together():
     assert report.review.verdict is Verdict.FAILED
 
 
+@pytest.mark.slow
 def test_data_that_do_not_say_how_uncertain_they_are_pass_nothing():
     found, report = judged(10.0, uncertainty=None)
     assert (found["measured"].verdict, found["measured"].reason) == (Verdict.UNDECIDED, Reason.NO_UNCERTAINTY)

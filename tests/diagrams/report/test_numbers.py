@@ -263,6 +263,7 @@ def test_a_users_loop_around_an_fmu_gets_a_report_without_the_sections_of_fig3()
     assert numbers["injection.voltage.sampled_d1.deviation"].value < 1e-3
 
 
+@pytest.mark.slow
 def test_a_source_that_steps_later_does_not_move_the_injection():
     numbers = analyse(speed_control(step_at=0.1), loops=["controller.voltage"], only=("injection",)).numbers()
     for quantity in ("deviation", "uncertainty"):
@@ -277,6 +278,7 @@ def test_a_source_that_steps_during_the_injection_after_a_run_leaves_no_number()
     assert all("the operating point moved by" in text for text in section.text)
 
 
+@pytest.mark.slow
 def test_loops_can_be_named():
     numbers = analyse(speed_control(), loops=["controller.voltage"], only=("inner",)).numbers()
     assert "inner.controller_voltage.sampled_d0.phase_margin_deg" in numbers

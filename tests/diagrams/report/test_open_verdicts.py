@@ -83,6 +83,7 @@ def limited(limit):
     return Diagram("limited", place(speed(Saturation(lower=-limit, upper=limit, name="drive")(law))))
 
 
+@pytest.mark.slow
 def test_a_step_of_no_given_size_is_small_enough_for_the_linear_model():
     """T = (3 s + 40)/(s² + 3 s + 40)."""
     asked = Requirements(loops={"u": {"step": {"overshoot": 1.0}}})
@@ -95,6 +96,7 @@ def test_a_step_of_no_given_size_is_small_enough_for_the_linear_model():
     assert [result.verdict for result in report.review.results if result.loop == "u"] == [Verdict.PASSED]
 
 
+@pytest.mark.slow
 def test_a_step_that_is_never_small_is_open_where_run_and_linear_model_differ_about_the_limit():
     asked = Requirements(loops={"u": {"step": {"overshoot": 1.0, "settling": 3.0}}})
     review = limited(1e-9).report(only=("steps",), requirements=asked).review
@@ -103,6 +105,7 @@ def test_a_step_that_is_never_small_is_open_where_run_and_linear_model_differ_ab
     assert "give the size for which the limit holds, size=…" in verdict_text(review)
 
 
+@pytest.mark.slow
 def test_reasons_of_open_verdicts_stand_below_the_table_each_once():
     step = {"input": "u", "output": "place.y", "length": 0.3, "settling": 5.0, "rise": 2.0}
     report = spring().report(only=("steps",), requirements=Requirements(stable=False, step=step, delay_margin_s=0.1))
@@ -150,6 +153,7 @@ def test_the_limit_of_a_largest_change_that_was_not_measured_has_the_unit_of_its
     assert [(r.verdict, r.required) for r in report.review.results] == [(Verdict.UNDECIDED, "≤ 5 m")]
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(("size", "holds"), [(1e-4, True), (1.0, False)])
 def test_a_required_response_that_the_linear_model_does_not_have_is_named_on_the_first_page(size, holds):
     """The drive reaches its limit of 0.4 at a step of 0.01 and more: its acceleration is 40 of the step, at first."""
@@ -185,6 +189,7 @@ def test_a_required_margin_that_no_loop_has_is_open_where_a_feedback_wire_is_mis
     assert "is a feedback wire missing?" in verdict_text(review)
 
 
+@pytest.mark.slow
 def test_a_required_margin_that_a_loop_of_several_entries_has_not_is_open():
     """Two axes, L = 2/(s (s + 0.2)) each: 8 degrees of phase margin by hand, which nobody would see."""
     speed = StateSpace(A=np.zeros((2, 2)), B=np.eye(2), C=np.eye(2), name="speed")
@@ -213,6 +218,7 @@ class Drive(Block):
         return x.speed * u.u
 
 
+@pytest.mark.slow
 def test_a_wire_that_counts_at_the_start_alone_lies_on_no_loop():
     """Speed and power of a drive, named for a plot: limits on them stayed open, as the drive itself is in a loop.
 

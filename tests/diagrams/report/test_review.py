@@ -150,6 +150,7 @@ def test_a_margin_on_a_kink_is_not_decided():
     assert found["phase_margin_deg"].reason is Reason.FINDINGS
 
 
+@pytest.mark.slow
 def test_a_loop_without_a_slope_has_no_margin_and_is_not_decided():
     report = analyse(
         loop(encoder=0.01), only=PARTS, requirements=Requirements(phase_margin_deg=45, stable=False), stairs="zero"
@@ -160,6 +161,7 @@ def test_a_loop_without_a_slope_has_no_margin_and_is_not_decided():
     assert any("The loop at controller.u" in text for text in report.sections[0].text)
 
 
+@pytest.mark.slow
 def test_a_moving_operating_point_is_not_decided():
     found = by_quantity(analyse(loop(start=0.5), only=PARTS, requirements=Requirements(phase_margin_deg=45)))
     assert (found["phase_margin_deg"].verdict, found["phase_margin_deg"].reason) == (Verdict.UNDECIDED, Reason.MOVING)
@@ -184,6 +186,7 @@ def test_a_step_is_judged_by_the_running_diagram():
     assert found["step.peak"].number.value == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(("peak", "verdict"), [(0.9, Verdict.UNDECIDED), (0.4, Verdict.FAILED)])
 def test_a_record_that_ends_early_decides_only_what_has_been_exceeded(peak, verdict):
     """After 0.2 s the response 1 − 0.97^k has come to 0.456; in the end it comes to 1."""
@@ -199,6 +202,7 @@ def test_a_record_that_ends_early_decides_only_what_has_been_exceeded(peak, verd
     assert any("has not settled in its record of 0.2 s" in text for text in steps.text)
 
 
+@pytest.mark.slow
 def test_a_slow_part_that_the_record_does_not_see_leaves_a_step_undecided():
     """Half of the response comes within 0.05 s, the other half with a time constant of 10 s."""
     wish = Constant(value=0.0, name="wish").named("w")
@@ -257,6 +261,7 @@ def test_an_unstable_diagram_fails_in_everything():
     assert {r.reason for r in unstable.review.results} == {Reason.UNSTABLE}
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
@@ -270,6 +275,7 @@ def test_names_that_the_diagram_does_not_have_are_refused_before_anything_is_com
         analyse(loop(), only=PARTS, requirements=Requirements(**asked))
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -447,6 +453,7 @@ def made(value, confirmed_by="a run"):
     return Number(value, "1", 1e-9, confirmed_by)
 
 
+@pytest.mark.slow
 def test_a_measurement_that_contradicts_the_linear_model_leaves_its_margins_undecided():
     start = "injection.u.sampled_d0"
     for deviation, uncertainty, reason in ((0.2, 1e-3, Reason.REFUTED), (0.2, 0.1, Reason.COMPARED)):

@@ -108,6 +108,7 @@ def test_a_worst_case_of_another_diagram_is_refused():
         analyse(make_pi_loop(2.0, 0.5, 2.0), only=("subject",), worst_case=other)
 
 
+@pytest.mark.slow
 def test_an_unstable_worst_case_stands_on_the_first_page_and_fails_its_requirements():
     # s(s + 2) + 2 (kp s + 0.5) has poles with the real part 0.5 at the corner kp = -1.5
     diagram = make_pi_loop()

@@ -218,6 +218,7 @@ def test_a_summary_has_two_sheets_where_smaller_figures_suffice_and_is_whole(row
     assert "CHAPTER" not in whole[0].partition("Contents")[0]
 
 
+@pytest.mark.slow
 def test_progress_says_what_is_computed_and_confirmed():
     told = []
     analyse(loop(), only=("inner", "steps", "sensitivity"), progress=told.append)

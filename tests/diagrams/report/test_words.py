@@ -105,6 +105,7 @@ def test_the_tables_have_them_where_the_numbers_carry_a_finding_as_well():
     assert id(number) in {id(cell) for table in part.tables for row in table.rows for cell in row}
 
 
+@pytest.mark.slow
 def test_an_fmu_that_moves_is_no_equilibrium():
     assert any("not an equilibrium" in t and "motor.current" in t for t in moving_report().sections[0].text)
 

@@ -110,6 +110,7 @@ def test_a_matrix_goes_out_row_by_row(run, tmp_path):
     assert same(loadmat(tmp_path / "run.mat")["mass"][:, 3], run["plant.mass"][:, 1, 0])
 
 
+@pytest.mark.slow
 def test_a_frame_does_not_change_the_run():
     run = make()
     before = run.t.copy(), run.data.copy()
@@ -134,6 +135,7 @@ def test_xarray_has_a_dimension_for_every_axis(run, tmp_path):
     assert data.attrs["title"] == "crane"
 
 
+@pytest.mark.slow
 def test_xarray_writes_it_as_netcdf_and_reads_it_back(run, tmp_path):
     run.to_xarray("v", "both", "mass").to_netcdf(tmp_path / "run.nc", engine="scipy")
     with xarray.open_dataset(tmp_path / "run.nc", engine="scipy") as data:

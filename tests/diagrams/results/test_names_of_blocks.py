@@ -36,6 +36,7 @@ def test_a_recording_of_a_block_has_all_its_outputs(loop):
     assert run["controller.pid.excess"].size
 
 
+@pytest.mark.slow
 def test_in_linear_models_and_requirements(loop):
     by_block = loop.linearize(inputs="wish", outputs="motor")
     by_port = loop.linearize(inputs="wish.y", outputs="motor.y")

@@ -17,6 +17,7 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, Run, subsystem
 
 
+@pytest.mark.slow
 def test_labels_of_neighbours_do_not_overlap_however_long_the_names_are():
     ramp = Ramp(slope=1.0, name="ramp")
     names = [f"a_{'long_' * k}name" for k in (0, 2, 4, 8, 10)]

@@ -99,6 +99,7 @@ def test_a_run_without_a_sample_is_empty(to, tmp_path):
         assert (run["e"].shape, run["box.b.v"].shape) == ((0,), (0, 2))
 
 
+@pytest.mark.slow
 def test_memory_holds_little_more_than_the_samples(monkeypatch):
     monkeypatch.setattr(_recorder, "_LARGEST", 2**20)
     n, width = 40_000, 49
@@ -119,6 +120,7 @@ def test_memory_holds_little_more_than_the_samples(monkeypatch):
     assert recorder._done == []  # each chunk was freed when it was copied
 
 
+@pytest.mark.slow
 def test_a_run_on_disk_holds_one_chunk_in_memory(tmp_path):
     n, width = 20_000, 399
     vector = np.arange(width, dtype=float)
@@ -362,6 +364,7 @@ def test_free_space_is_that_of_the_nearest_folder_that_exists(tmp_path):
     assert _recorder.free_on_disk(tmp_path / "a" / "b") == pytest.approx(_recorder.free_on_disk(tmp_path), rel=0.1)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("columns", [None, range(1, 20_000, 2)], ids=["all", "some"])
 def test_watching_many_outputs_takes_no_time(columns):
     """20,000 outputs took 3 s of the processor in two places: each copied all before it, or searched all columns."""

@@ -108,6 +108,7 @@ def test_the_review_is_the_table_of_the_first_page(diagram):
         assert float(shown[5].split()[0]) == pytest.approx(float(cells[5]), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_everything_that_shows_itself_has_a_table_a_short_text_and_no_file(diagram, run, monkeypatch, tmp_path):
     model = diagram.linearize()
     loop = model.loop("u")

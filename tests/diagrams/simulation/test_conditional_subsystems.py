@@ -255,6 +255,7 @@ def test_an_inner_box_follows_its_own_signal_whatever_happened_while_the_outer_o
     assert len(set(run["y"][(run.t >= 0.45) & (run.t < 0.7)])) == 1
 
 
+@pytest.mark.slow
 def test_a_sampled_box_in_a_continuous_enabled_one_acts_at_its_ticks_while_that_is_open():
     @subsystem(enabled="held")
     def outer():
@@ -269,6 +270,7 @@ def test_a_sampled_box_in_a_continuous_enabled_one_acts_at_its_ticks_while_that_
 # --- triggered in continuous time -------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     ("edge", "first", "apart"), [("rising", 0.0, 0.5), ("falling", 0.25, 0.5), ("both", 0.0, 0.25)]
 )

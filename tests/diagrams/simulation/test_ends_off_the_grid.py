@@ -11,6 +11,7 @@ from support.hybrid_blocks import Falls, Lag, counting
 from support.tanks import CALLS, Tank
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("solver", ["auto", "DOP853", "BDF", "rk4"])
 @pytest.mark.parametrize("duration", [0.25, 0.05, 1 / 3, np.pi])
 def test_the_last_sample_is_at_the_end(solver, duration):

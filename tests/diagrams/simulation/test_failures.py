@@ -113,6 +113,7 @@ def unstable():
     return experiments.hand_guiding(tool_mass=5.0)
 
 
+@pytest.mark.slow
 def test_leaving_the_domain_of_the_path_says_where_and_keeps_the_samples():
     experiment = unstable()
     with pytest.raises(PathDomainError) as error:

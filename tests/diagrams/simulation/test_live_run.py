@@ -64,6 +64,7 @@ def same(run, other):
     )
 
 
+@pytest.mark.slow
 def test_a_live_run_has_the_numbers_of_a_plain_one():
     diagram = servo(Constant(value=1.0, name="target"))
     plain = diagram.simulate(10 * T, progress=False)

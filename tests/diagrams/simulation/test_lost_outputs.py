@@ -38,6 +38,7 @@ def assert_went_on(run, value=np.nan):
     assert "ports=" in said[0]
 
 
+@pytest.mark.drawn(1)
 @INTERFACES
 @PLACES
 @TIERS
@@ -73,6 +74,7 @@ def test_infinite_numbers_are_no_others(cache, tmp_path, compiled):
     assert_went_on(diagram.simulate(END, step=H, progress=False, compile=compiled), np.inf)
 
 
+@pytest.mark.drawn(1)
 @TIERS
 def test_in_a_diagram_that_is_compiled_block_by_block(file, compiled, monkeypatch):
     monkeypatch.setattr("loopwright.diagrams.flat.flat_diagram.FlatDiagram.by_block", True)
@@ -139,6 +141,7 @@ def test_a_sweep_goes_on_as_a_run(file, compiled):
         np.testing.assert_array_equal(np.isnan(found["plant.lost"][i]), slope * found.t > LIMIT + 1e-6)
 
 
+@pytest.mark.drawn(1)
 @INTERFACES
 def test_a_linear_model_where_it_is_no_number_names_the_output(file, interface):
     def point_and_diagram(**options):

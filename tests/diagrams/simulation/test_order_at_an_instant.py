@@ -304,6 +304,7 @@ def test_initial_states_are_computed_in_an_order_of_their_own():
 # --- between ticks ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(4)
 @pytest.mark.parametrize("solver", ["DOP853", "RK45", "Radau", "BDF", "LSODA", "CVODE_BDF", "auto"])
 def test_a_step_of_a_source_inside_a_step_of_the_solver_is_landed_on(solver):
     diagram = Diagram("d", Lag(name="lag")(Step(times=(0.35, 0.62), values=(1.0, -2.0))))
@@ -329,6 +330,7 @@ def test_values_before_a_discontinuity_are_taken_from_the_left():
         assert np.max(np.abs(run["i.y"] - np.where(run.t > 0.25, 4 * (run.t - 0.25), 0))) <= tolerance
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(("solver", "order"), [("euler", 1), ("heun", 2), ("rk4", 4)])
 def test_the_order_of_a_fixed_step_survives_edges_inside_and_at_steps(solver, order):
     """ẏ = u − y, u a train of pulses whose edges fall on and between the steps."""
@@ -626,6 +628,7 @@ def test_of_two_opaque_blocks_with_one_function_the_one_that_failed_is_named():
         Diagram("d", *box(Clock())).simulate(1.0, progress=False)
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("duration", [0, -1.0, float("nan"), float("inf"), "1 s"])
 def test_a_duration_that_is_none_is_refused_for_a_continuous_diagram_too(duration):
     with pytest.raises(OptionError, match=r"d\.duration: found a duration of .*; expected seconds, positive"):

@@ -49,6 +49,7 @@ from support.hybrid_blocks import TIGHT, Crossings, Falls, Lag, Takes, counting,
 # --- time --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(4)
 @pytest.mark.parametrize("solver", ["euler", "heun", "rk4", "RK45", "DOP853", "BDF", "CVODE_BDF", "auto"])
 def test_no_solver_misses_a_sample(solver):
     """A fixed step may be longer than the time between samples, or no divisor of it."""

@@ -110,6 +110,7 @@ class Narrow(Block):
         return np.where(np.sin(2 * np.pi * t / 10.0) > 0.999999, 1.0, 0.0)
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("block", [Pulse(), Pulse(begin=7.77), Narrow()])
 def test_a_pulse_anywhere_in_the_runs_duration_is_found(block):
     check_block(block)  # it is smooth in the first second
@@ -128,7 +129,7 @@ def test_foreign_code_on_a_clock_is_looked_at_along_it():
         check_block(function, {"u": Clock()}, duration=10.0)
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["equation", "on a clock", "table"])
 def test_a_linear_model_along_the_motion_passes_through_the_pulse(case):
     """Over 10 s the integral grows by the pulse's area, and its square by the area of it along the motion."""
@@ -145,6 +146,7 @@ def test_a_linear_model_along_the_motion_passes_through_the_pulse(case):
     assert grown["z.y"] == pytest.approx(6.8, rel=1e-3)  # (10 s − 3.2 s), but for the width of the pulse
 
 
+@pytest.mark.slow
 @pytest.mark.one_tier
 def test_instants_between_samples_are_asked_for_once(monkeypatch):
     """Noise that changes 6 times between two samples, by 1/(s + 1): each change is found once, however C is called."""

@@ -35,6 +35,7 @@ def test_between_ticks_the_run_ends_at_the_crossing():
     assert run["f.h"][-1] == pytest.approx(1 - 9.81 * 0.4321**2 / 2, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_in_a_sampled_box_it_ends_at_the_tick():
     @subsystem(sample_time=0.1)
     def box(t):

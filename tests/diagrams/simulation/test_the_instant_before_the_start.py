@@ -34,6 +34,7 @@ def exponential(t):
     return 10.0 * np.exp(-10.0 * t)
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     "source",
     [

@@ -49,7 +49,7 @@ def library(path, folder):
 # ---- the description ----
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 @form
 @pytest.mark.parametrize("make", MODELS)
 def test_valid(uncompiled, make, options):

@@ -341,6 +341,7 @@ def test_an_event_says_whether_it_has_moved_a_continuous_state(build, exchange):
     assert me.item["on"] == 0.0  # it has switched the heating off
 
 
+@pytest.mark.drawn(1)
 def test_a_saved_state_resumes_bit_identically_with_its_domains(build, exchange):
     path = build(echoing_ball())
     me, fresh = exchange(path).start(), exchange(path)

@@ -116,6 +116,7 @@ def test_outputs_are_converted_for_their_consumers_and_recorded_in_their_own_uni
     assert run["mean.y"][-1] == pytest.approx(50.0 + (300.0 * 1.8 - 459.67), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_jacobians_have_the_factor(file):
     plant = Fmu(file, name="plant", convert_units=True, isolate=False)
     push = Gain(gain=1.0, name="push")(Sine(amplitude=1.0, frequency=1.0, unit="kN", name="hand"))
