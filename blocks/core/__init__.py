@@ -8,12 +8,6 @@ from .block import SOLVED, Block
 from .brief import brief, count_of, enumerate_some
 from .collection import without_collection
 from .control_systems import as_block
-from .disk import (
-    OTHER_TEMPORARY,
-    describe_disk_error,
-    explain_disk_errors,
-    find_disk_error,
-)
 from .errors import (
     AlgebraicLoopError,
     BetweenTicksError,
@@ -49,7 +43,15 @@ from .errors import (
 )
 from .evaluation_vectors import EvaluationVectors, Wanted
 from .explained_calls import UnknownArgumentError, explain_calls, offer_elsewhere
-from .files import check_file, replace_file, write_text
+from .files import (
+    OTHER_TEMPORARY,
+    check_file,
+    describe_disk_error,
+    explain_disk_errors,
+    find_disk_error,
+    replace_file,
+    write_text,
+)
 from .findings import Finding
 from .frozen import FrozenMapping
 from .instants import FINEST, exact_number, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of

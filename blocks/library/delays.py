@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..core import Array, Block, Input, Output, SampleTimeError, State, exact_number, parameter
-from .past_inputs import PastInputs
+from .remembered_inputs import PastInputs
 
 
 class Delay(PastInputs):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core import Array, Block, Input, Output, ParameterError, State, kinds, lay_out, parameter
 from .linear import section
-from .past_inputs import PastInputs
+from .remembered_inputs import PastInputs
 
 
 class FIR(PastInputs):

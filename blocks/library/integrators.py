@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core import Array, Block, Event, Input, Output, ParameterError, ShapeError, State, clip, kinds, parameter
 from .branching import truth
-from .initial_values import StartsAtInput
+from .remembered_inputs import StartsAtInput
 
 _WEIGHTS = {"forward": (0.0, 1.0), "backward": (1.0, 0.0), "trapezoidal": (0.5, 0.5)}
 """Shares of this tick's and of the last tick's input in a sum, by rule."""

@@ -26,7 +26,7 @@ from ..core import (
     parameter,
 )
 from .branching import NumberedInputs, check_fits, expect_scalar, truth, unit_of_one
-from .initial_values import StartsAtInput
+from .remembered_inputs import StartsAtInput
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}
 """For each relation: a sign s, and the value of y where s (u₁ − u₂) is positive."""

@@ -26,7 +26,7 @@ from ..core import (
     shorten,
 )
 from .branching import expect_scalar
-from .initial_values import StartsAtInput
+from .remembered_inputs import StartsAtInput
 
 
 class Quantizer(Block):

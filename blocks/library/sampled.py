@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..core import Array, Block, Input, Output, State, parameter
-from .initial_values import StartsAtInput
+from .remembered_inputs import StartsAtInput
 
 
 class UnitDelay(StartsAtInput, Block):

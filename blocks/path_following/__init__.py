@@ -3,8 +3,7 @@
 from .compliance import AdmittanceFilter, ErrorDynamics
 from .environment import HandForce, PathSpring
 from .feedback_linearization import FeedbackLinearization
-from .planar_model import PlanarModel
-from .planar_slopes import PlanarSlopes, planar_slopes
+from .planar_model import PlanarModel, PlanarSlopes, planar_slopes
 from .transverse import (
     A_MODEL,
     A_PATH,

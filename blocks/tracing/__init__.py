@@ -7,10 +7,19 @@ from .equations import initial_state, is_only_sampled, start_shapes, start_value
 from .model_exchange import describe_model_exchange
 from .numpy_check import GUARDS, NEXT, Columns, Point, Values, evaluate
 from .opaque_equations import raise_failure
-from .operations import MATH_FUNCTIONS
 from .structure import has_structure, is_traced_by, traced_parameters
 from .switching_times import Line, switching_times
-from .symbols import bundle, count_uses, flat_column, has_large_product, is_nonzero, size, with_values, wrap
+from .symbols import (
+    MATH_FUNCTIONS,
+    bundle,
+    count_uses,
+    flat_column,
+    has_large_product,
+    is_nonzero,
+    size,
+    with_values,
+    wrap,
+)
 from .traced import Traced, constants_of, trace
 from .traced_array import as_traced
 

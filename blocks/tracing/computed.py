@@ -13,9 +13,9 @@ import casadi as ca
 import numpy as np
 
 from ..core import Block
+from .discretization import hold_of_symbols
 from .equations import match_ports
 from .structure import traced_parameters
-from .symbolic_hold import hold_of_symbols
 from .symbols import bundle, flat_column, size, wrap
 from .traced import Traced, _Tracer, constants_of
 

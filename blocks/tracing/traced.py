@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 
 from ..core import SOLVED, Block, Layout, LoopwrightError, SampleTimeError, Shape, TraceError, Value
-from .discretization import find_hold
+from .discretization import find_hold, trapezoidal_step
 from .equations import (
     check_definition,
     guards_of,
@@ -38,7 +38,6 @@ from .numpy_check import GUARDS, NEXT, compare
 from .opaque_equations import Foreign
 from .structure import structure, traced_parameters
 from .symbols import bundle, expand, flat_column, size, with_values, with_zeros, wrap
-from .trapezoid import trapezoidal_step
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks.tracing.symbolic_hold import hold_of_symbols
+from loopwright.blocks.tracing.discretization import hold_of_symbols
 from loopwright.blocks.tracing.symbols import wrap
 from loopwright.diagrams import Diagram, subsystem
 from support.sampled import TICKS, T, Wave, network, run_of, wave

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Block, Input, Output, TraceError
-from loopwright.blocks.tracing.rounding import record_rounding, watch
+from loopwright.blocks.tracing.numpy_check import record_rounding, watch
 from loopwright.blocks.tracing.traced import trace
 from loopwright.blocks.tracing.traced_functions import NotTracedError
 

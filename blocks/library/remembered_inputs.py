@@ -1,4 +1,4 @@
-"""Past inputs: base and state of the sampled blocks that remember the last n values of their input."""
+"""Bases of blocks that remember their input: as it is just before t = 0, and its last n values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,21 @@ from typing import Any
 import numpy as np
 
 from ..core import Array, Block, Input, Shape, ShapeError, State
-from .initial_values import StartsAtInput
+
+
+class StartsAtInput:
+    """A block that remembers its input ``u``: without an ``initial_value``, as it is just before t = 0."""
+
+    initial_value: Array | None
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether `initial` computes the state."""
+        return self.initial_value is None
+
+    def initial(self, u: Any) -> Array:
+        """Return the state at the start."""
+        return u.u
 
 
 class History(State):
