@@ -42,6 +42,7 @@ typedef struct {
     double segment; /* rk4: begin of the equal substeps, since the last event */
     double length;  /* rk4: length of all substeps */
     long n, i;      /* rk4: number of substeps, and of those done */
+    long events;    /* that have fired */
     bool fresh;     /* after a jump: slope and step size must be found again */
     bool rejected;
 } lw_run;
@@ -158,7 +159,44 @@ static bool lw_meet_inputs(lw_instance *self, double t, const double *u, bool *e
     memcpy(self->next, self->x, LW_N_S * sizeof(double));
     return true;
 }
+
+/* Let events fire at t, the first time in a step at which an indicator leaves its domain; the run continues from there. In
+ * Event Mode they are the importer's: self->event_found. */
+static bool lw_meet_event(lw_instance *self, lw_run *run, const lw_span *span, double t) {
+    double z[LW_N_Z], fired[LW_N_Z];
+    bool any;
+    lw_dense_state(self, span, t, self->stage);
+    memcpy(self->x, self->stage, LW_N_S * sizeof(double));
+    if (!lw_find_fired(self, t, self->x, span->u, z, fired, &any)
+        || !lw_record(self, t, fmax(fabs(t), fabs(run->end)), fired)) return false;
+    run->fresh = true;
+    self->s.step_size = 0.0;
+    self->event_found = any && self->event_mode_used && (self->early_return_allowed || t == run->end);
+    memcpy(self->next, self->x, LW_N_S * sizeof(double));
+    if (self->event_found) return true;
+    if (++run->events > LW_MAX_EVENTS) {
+        char names[256];
+        return lw_fail(self, "more than %d events within one communication step, the last %s at t = %.9g s. Take shorter "
+                       "steps, or give the model a hysteresis.", LW_MAX_EVENTS, lw_names_of(fired, names, sizeof names), t);
+    }
+    if (!lw_iterate(self, t, self->x, span->u, &any)) return false;
+    memcpy(self->next, self->x, LW_N_S * sizeof(double));
+    return true;
+}
 #endif
+
+/* Continue at t with the inputs that the importer has set there, as after a jump; see lw_intermediate_update for `leave`. */
+static bool lw_take_inputs(lw_instance *self, lw_run *run, double t, bool *leave) {
+    self->s.step_size = 0.0;
+    if (run->integrator != LW_RK4 && LW_N_X > 0) run->fresh = true;
+#if LW_N_Z
+    if (!lw_meet_inputs(self, t, lw_inputs_of_step(self), &self->event_found)) return false;
+    *leave = self->event_found;
+#else
+    (void)t, (void)leave;
+#endif
+    return true;
+}
 
 /* Integrate from t over h to end: adaptively, with events, or with an intermediate update. Afterwards self->next holds the
  * states at the end and `end` the time. If Event Mode is used, an event ends the step: self->event_found. */
@@ -174,44 +212,26 @@ static bool lw_advance(lw_instance *self, double t, double h, double *end) {
 #endif
     bool leave = false;
 #if LW_N_Z
-    double z[LW_N_Z], fired[LW_N_Z];
     const double *u = lw_inputs_of_step(self);
-    bool any;
-    long count = 0;
     if (!lw_meet_inputs(self, t, u, &self->event_found)) return false;
     leave = self->event_found;
 #endif
     for (long steps = 0; t < run.end && !leave; steps++) {
-        double to = run.end;
+        double to = run.end, first = INFINITY; /* the time of its first event */
         if (run.integrator != LW_RK4 && steps == LW_MAX_STEPS)
             return lw_fail(self, "the integrator has taken %d steps up to t = %.9g s. A stiff model needs integrator = 3; else take "
                            "shorter communication steps, or a larger tolerance.", LW_MAX_STEPS, t);
         if (!lw_next_step(self, &run, t, &to)) return false;
-        double first = INFINITY;
 #if LW_N_Z
-        lw_span span = {t, to, LW_ULPS * fmax(fabs(t), fabs(to)), u};
+        const lw_span span = {t, to, LW_ULPS * fmax(fabs(t), fabs(to)), u};
         if (!lw_scan(self, &span, run.integrator == LW_RK4 ? 1 : LW_PIECES, &first)) return false;
         if (isfinite(first)) {
-            lw_dense_state(self, &span, first, self->stage);
-            memcpy(self->x, self->stage, LW_N_S * sizeof(double));
             t = first;
-            if (!lw_find_fired(self, t, self->x, u, z, fired, &any)
-                || !lw_record(self, t, fmax(fabs(t), fabs(run.end)), fired)) return false;
-            run.fresh = true;
-            self->s.step_size = 0.0;
-            self->event_found = any && self->event_mode_used && (self->early_return_allowed || t == run.end);
-            memcpy(self->next, self->x, LW_N_S * sizeof(double));
+            if (!lw_meet_event(self, &run, &span, t)) return false;
             if (self->event_found) break;
-            if (++count > LW_MAX_EVENTS) {
-                char names[256];
-                return lw_fail(self, "more than %d events within one communication step, the last %s at t = %.9g s. Take shorter "
-                               "steps, or give the model a hysteresis.", LW_MAX_EVENTS, lw_names_of(fired, names, sizeof names), t);
-            }
-            if (!lw_iterate(self, t, self->x, u, &any)) return false;
-            memcpy(self->next, self->x, LW_N_S * sizeof(double));
         }
 #endif
-        if (!isfinite(first)) {
+        if (!isfinite(first)) { /* the whole step is accepted */
             memcpy(self->x, self->next, LW_N_S * sizeof(double));
             if (run.integrator == LW_DOPRI5) memcpy(self->k, self->k + 6 * LW_N_X, LW_N_X * sizeof(double));
             t = to;
@@ -219,12 +239,7 @@ static bool lw_advance(lw_instance *self, double t, double h, double *end) {
         if (!self->update) continue;
         if (!lw_intermediate_update(self, &run, t, &leave)) return false;
         if (leave || t >= run.end || !lw_inputs_jumped(self)) continue; /* inputs set at the end belong to the next step */
-        self->s.step_size = 0.0;
-        if (run.integrator != LW_RK4 && LW_N_X > 0) run.fresh = true;
-#if LW_N_Z
-        if (!lw_meet_inputs(self, t, u, &self->event_found)) return false;
-        leave = self->event_found;
-#endif
+        if (!lw_take_inputs(self, &run, t, &leave)) return false;
     }
     *end = t;
     return true;
