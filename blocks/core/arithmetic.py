@@ -128,8 +128,8 @@ class Gain(Block):
             check_shapes(gain=self.gain, u=u.u)
         elif found[:1] != gain[1:]:
             raise ShapeError(
-                f"found shape {found}; the gain is a matrix of {gain[0]} × {gain[1]} and takes {gain[1]} entries. "
-                "Take a part of the signal, or give another matrix.",
+                f"found {f'shape {found}' if found else 'a scalar'}; the gain is a matrix of {gain[0]} × {gain[1]} and "
+                f"takes {gain[1]} entries. Wire a signal of as many, or give another matrix.",
                 port="u",
             )
         return self.gain @ u.u if getattr(self.gain, "ndim", 0) == 2 else self.gain * u.u

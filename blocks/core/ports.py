@@ -53,7 +53,9 @@ class Port:
         self.shape, self.unit, self.description, self.name = _shape_of(shape), _unit_of(unit), description, name
         self.nominal, self.minimum, self.maximum, self.only_if = nominal, minimum, maximum, only_if
         if nominal is not None and not nominal > 0:
-            raise DefinitionError(f"found nominal {nominal!r}; expected a positive number.")
+            raise DefinitionError(
+                f"found nominal {nominal!r}; expected a positive number. Give the port's typical size."
+            )
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name  # checked by check_port_names: Python would wrap an error raised here in a RuntimeError
@@ -341,9 +343,11 @@ class Event(Port):
         super().__init__((), None, description, name, nominal=float(nominal), only_if=only_if)
         self.hysteresis = float(hysteresis)
         if not self.hysteresis >= 0.0:
-            raise DefinitionError(f"found hysteresis {hysteresis!r}; expected a number of zero or more.")
+            raise DefinitionError(f"found hysteresis {hysteresis!r}; expected a number of zero or more. Give one.")
         if direction not in ("both", "rising", "falling"):
-            raise DefinitionError(f"found direction {direction!r}; expected 'both', 'rising' or 'falling'.")
+            raise DefinitionError(
+                f"found direction {direction!r}; expected 'both', 'rising' or 'falling'. Give one of these."
+            )
         self.direction = direction
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:

@@ -7,6 +7,7 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 from __future__ import annotations
 
 import operator
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
@@ -136,7 +137,7 @@ def _as_index(index: Any, port: str) -> int | slice:
         return slice(*(None if i is None else integer(i) for i in (index.start, index.stop, index.step)))
     except TypeError:
         raise WiringError(
-            f"found the index {index!r}; expected an integer or a slice of integers, as in y[0] or y[:2].", port=port
+            f"found the index {index!r}; expected an integer or a slice of integers. Write y[0] or y[:2].", port=port
         ) from None
 
 
@@ -221,10 +222,20 @@ def primary_outputs(outputs: Mapping[str, Any]) -> list[str]:
     return [name for name, port in outputs.items() if not getattr(port, "secondary", False)]
 
 
+def _near_name(name: Any) -> str:
+    """Return a name that is allowed, as near as it can be to one that isn't."""
+    made = re.sub(r"\W+", "_", name).strip("_") if isinstance(name, str) else ""
+    made = f"n_{made}" if made[:1].isdigit() else made
+    return made if made.isidentifier() else "v_perp"
+
+
 def check_name(name: Any) -> str:
     """Return ``name`` if it can name a block or a wire."""
     if not (isinstance(name, str) and name.isidentifier()):
-        raise WiringError(f"found the name {name!r}; expected letters, digits and underscores, such as 'v_perp'.")
+        raise WiringError(
+            f"found the name {name!r}; expected letters, digits and underscores, with no digit first. "
+            f"Take {_near_name(name)!r}."
+        )
     return name
 
 
@@ -241,7 +252,7 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     made = as_block(value, "(…)")
     raise WiringError(
         f"found {shorten(value)}; expected a signal, a call, a block with one output, finite numbers, or a list of "
-        "these." + f" {made}." * bool(made),
+        "these. " + (f"{made}." if made else "Wire an output by its name, such as plant.y."),
         block=block,
         port=port,
     )

@@ -104,7 +104,7 @@ class IIR(Block):
         if not alike or len(shapes[0]) not in (1, 2) or 0 in shapes[0] + shapes[1]:
             raise ParameterError(
                 f"found b of shape {shapes[0]} and a of shape {shapes[1]}; expected two lists of coefficients, or two "
-                "matrices with one row for each section.",
+                "matrices with one row for each section. Give b and a as scipy.signal.butter(…) returns them.",
                 port="b",
             )
         if np.any(np.asarray(self.a)[..., 0] == 0):
@@ -135,8 +135,8 @@ class IIR(Block):
         rows = np.asarray(sections, dtype=float)
         if rows.ndim != 2 or rows.shape[1] != 6 or not len(rows):
             raise ParameterError(
-                f"found shape {rows.shape}; expected rows of six numbers, as scipy.signal.butter(…, output='sos') "
-                "gives.",
+                f"found shape {rows.shape}; expected rows of six numbers. Give those of scipy.signal.butter(…, "
+                "output='sos'), or two lists: b and a.",
                 block=name or cls.__name__,
                 port="sections",
             )

@@ -103,7 +103,7 @@ class Function(Block):
         return dict.fromkeys(self.outputs, result_unit(self.function, units)) if len(self.outputs) == 1 else {}
 
     def _refuse(self, port: str, found: str, expected: str) -> ParameterError:
-        return ParameterError(f"found {found}; expected {expected}.", block=self.label, port=port)
+        return ParameterError(f"found {found}; expected {expected}. Give these.", block=self.label, port=port)
 
     def _arguments(self) -> list[str]:
         """Return the names of the function's arguments that have no default."""

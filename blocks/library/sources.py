@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Output, ParameterError, Source, move_earlier, parameter
+from ..core import Array, Output, ParameterError, Source, move_earlier, parameter, shorten
 
 
 def smooth_step(
@@ -61,7 +61,8 @@ class SmoothStep(Source):
         if starts.ndim > 1 or durations.ndim > 1 or not len(levels) - 1 == len(starts) == len(durations):
             raise ParameterError(
                 f"found {len(levels)} levels, {len(starts)} start times and {len(durations)} durations; expected one "
-                "start time and one duration for each step between two levels.",
+                "start time and one duration for each step between two levels. Give one level more than steps, such as "
+                "levels=(0.0, 1.0), start_times=(0.5,), durations=(0.2,).",
                 port="levels",
             )
         if np.any(starts[1:] < (starts + durations)[:-1]):
@@ -108,7 +109,8 @@ class Step(Source):
         super().check()
         if np.shape(self.times) != np.shape(self.values) or np.any(np.diff(np.atleast_1d(self.times)) <= 0):
             raise ParameterError(
-                f"found times {self.times!r} and values {self.values!r}; expected rising times, one value each.",
+                f"found times {shorten(self.times)} and values {shorten(self.values)}; expected rising times, one "
+                "value each. Give lists of one length, such as times=(0.5, 2.0), values=(1.0, 0.0).",
                 port="times",
             )
 

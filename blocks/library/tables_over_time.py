@@ -51,7 +51,8 @@ class _Table(Source):
         if len(values) not in (1, 2) or values[0] != times[0]:
             raise ParameterError(
                 f"found values of shape {values} for {times[0]} times; expected shape ({times[0]},), or "
-                f"({times[0]}, n) for vectors of n entries.",
+                f"({times[0]}, n) for vectors of n entries. Give one row of values for each time (values.T turns "
+                "columns into rows).",
                 port="values",
             )
 
@@ -153,7 +154,9 @@ class Recorded(_Table):
         separator = max(",;\t", key=head.count)
         lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator) if row]
         if not lines:
-            raise OptionError(f"{str(path)!r} is empty; expected a line of names, then numbers.", port="path")
+            raise OptionError(
+                f"{str(path)!r} is empty; expected a line of names, then numbers. Name another file.", port="path"
+            )
         names, *rows = lines
         table: dict[str, list[float]] = {name: [] for name in names}
         for number, row in enumerate(rows, 2):

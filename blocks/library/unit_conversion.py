@@ -51,7 +51,8 @@ class UnitConversion(Block):
             factor, _ = self.law
         except (UnitError, TypeError, AttributeError) as error:
             raise ParameterError(
-                f"found {self.from_unit!r} and {self.to_unit!r}; expected two units of one dimension. {error}",
+                f"found {self.from_unit!r} and {self.to_unit!r}; expected two units of one dimension. {error} Give "
+                "another unit.",
                 port="to_unit",
             ) from None
         except (ValueError, IndexError):

@@ -207,12 +207,16 @@ def start_values(block: Block, shapes: Mapping[str, Shape]) -> dict[str, np.ndar
     for name, port in block.states.items():
         if port.like is not None and port.like not in shapes:
             raise DefinitionError(
-                f"found like={port.like!r}; expected an input: {', '.join(shapes) or 'there are none'}.", port=name
+                f"found like={port.like!r}; expected an input: {', '.join(shapes) or 'there are none'}. Name one, "
+                "or give shape=….",
+                port=name,
             )
         if isinstance(port.start, str) and port.start not in block.parameters and not hasattr(block, port.start):
             known = ", ".join(block.parameters) or "there are none"
             raise DefinitionError(
-                f"found start={port.start!r}; expected a number or the name of a parameter: {known}.", port=name
+                f"found start={port.start!r}; expected a number or the name of a parameter: {known}. Give "
+                "one of these, or start=0.0.",
+                port=name,
             )
         try:
             values[name] = port.start_value(block, shapes)
@@ -260,10 +264,16 @@ def _flat_states(made: Any, states: Mapping[str, Shape], equation: str) -> np.nd
     for name, part in zip(names, parts_of(made, names, equation), strict=True):
         shape = _shape(part)
         if shape is None:
-            raise TraceError(f"its {equation} returned {_describe(part)} for {name}; expected numbers.", port=name)
+            raise TraceError(
+                f"its {equation} returned {_describe(part)} for {name}; expected numbers. Return "
+                "numbers of the state's shape.",
+                port=name,
+            )
         if size(shape) != size(states[name]):
             raise ShapeError(
-                f"its {equation} gives shape {shape}; expected {states[name]}, as the state has.", port=name
+                f"its {equation} gives shape {shape}; expected {states[name]}, as the state has. Return that shape, or "
+                "declare State(shape=…).",
+                port=name,
             )
         columns.append(np.ravel(np.asarray(part, dtype=float)))
     return np.concatenate(columns)

@@ -95,7 +95,9 @@ def wrap(flat: Any, shape: Shape) -> Any:
         return as_traced(ArrayInterface(flat.T, ndim=1))
     if len(shape) == 2:
         return as_traced(ArrayInterface(ca.reshape(flat, shape[1], shape[0]).T, ndim=2))
-    raise ShapeError(f"found a signal of shape {shape}; expected at most two dimensions.")
+    raise ShapeError(
+        f"found a signal of shape {shape}; expected at most two dimensions. Wire its parts, such as signal[0]."
+    )
 
 
 def flat_column(value: Any) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...blocks.core import UnknownNameError, elements, near
 from ..flat import FlatDiagram
-from ..results import resolve
+from ..results import explain_input, resolve
 from ..wiring import Wire, explain_absent_state, index_of, split_entry
 
 
@@ -41,6 +41,7 @@ def find_signal(flat: FlatDiagram, name: str) -> Tap:
             raise
         known = {n.rpartition(".")[2] for n in (*wires, *ports)} | {*wires, *ports}
         reason = explain_absent_state(flat.table.blocks, name)
+        reason = reason or explain_input(flat.table.blocks, name, flat.table.wires)
         step = f"{reason[0].upper()}{reason[1:]}" if reason else near(name, known)
         raise UnknownNameError(f"there is no signal {name!r} in this diagram. {step}") from None
     wire = wires[full] if full in wires else Wire(*flat.ports[full])

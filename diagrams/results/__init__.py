@@ -6,7 +6,7 @@ from .recorded_texts import TextSignal
 from .recorder import Recorder, Recording, machine_memory
 from .run import Run, Snapshot
 from .saved_state import RunState, check_fits, layout_of, not_open_error
-from .signal_names import resolve
+from .signal_names import explain_input, resolve
 from .step_info import ExpectedStep, StepInfo, is_at_rest, measure_step
 from .stored import SWEEP_HEADER, Occurrence, Stopped
 
@@ -27,6 +27,7 @@ __all__ = [
     "Stopped",
     "TextSignal",
     "check_fits",
+    "explain_input",
     "is_at_rest",
     "layout_of",
     "machine_memory",

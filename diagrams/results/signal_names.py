@@ -64,8 +64,25 @@ def resolve(
         )
     if reason := explain_absent_state(blocks or {}, name):
         raise UnknownNameError(f"no signal {name!r} was recorded: {reason}")
+    if reason := explain_input(blocks or {}, name):
+        raise UnknownNameError(f"no signal {name!r} was recorded: {reason}")
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}
     raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
+
+
+def explain_input(blocks: Mapping[str, Any], name: str, wires: Mapping[tuple[str, str], Wire] | None = None) -> str:
+    """Return why an input's name is no signal, and what is one: by ``wires``, by block and input, the source itself."""
+    for path, block in blocks.items() if "." in name else ():
+        for port in block.inputs:
+            if f".{path}.{port}".endswith(f".{name}"):
+                step = "Name the wire that feeds it."
+                if wires is not None:
+                    source = wires.get((path, port))
+                    step = (
+                        f"Give {str(source)!r}, which feeds it." if source else "Wire a Constant to it, and give that."
+                    )
+                return f"{port!r} is an input of {path!r}, and signals are outputs. {step}"
+    return ""
 
 
 def _output_itself(name: str, found: Collection[str]) -> str:

@@ -17,6 +17,10 @@ KINDS = ("grid", "latin")
 _SCALES = ("linear", "log")
 
 
+_BOX = "Give (low, high), such as (0.5, 2.0), or Box(low, high, scale='log')."
+"""Next step where a range is expected."""
+
+
 @explain_calls
 @accepts(None, scale=kinds.choice(*_SCALES).worded(found=kinds.by_name))
 @dataclass(frozen=True)
@@ -44,12 +48,17 @@ class Box:
         try:
             low, high = np.array(self.low, dtype=float), np.array(self.high, dtype=float)
         except (TypeError, ValueError):
-            raise OptionError(f"found a range from {self.low!r} to {self.high!r}; expected two numbers.") from None
+            raise OptionError(
+                f"found a range from {self.low!r} to {self.high!r}; expected two numbers. {_BOX}"
+            ) from None
         if low.shape != high.shape:
-            raise OptionError(f"found ends of shapes {low.shape} and {high.shape}; expected equal shapes.")
+            raise OptionError(
+                f"found ends of shapes {low.shape} and {high.shape}; expected equal shapes. Give both ends for each "
+                "entry."
+            )
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
             raise OptionError(
-                f"found a range from {self.low!r} to {self.high!r}; expected finite ends, the lower one first."
+                f"found a range from {self.low!r} to {self.high!r}; expected finite ends, the lower one first. {_BOX}"
             )
         if self.scale == "log" and not (low > 0.0).all():
             raise OptionError(
@@ -72,7 +81,7 @@ class Box:
                 return cls(*value)
             except OptionError as error:
                 raise error.at(block=name) from None
-        raise OptionError(f"found {value!r}; expected a range: (low, high), or Box(low, high).", block=name or None)
+        raise OptionError(f"found {value!r}; expected a range, of two ends. {_BOX}", block=name or None)
 
     @property
     def size(self) -> int:
@@ -297,11 +306,15 @@ def table(rows: Any, *, seed: int = 0) -> Samples:
         sizes = {name: len(values) for name, values in columns.items()}
         if len(set(sizes.values())) > 1:
             found = ", ".join(f"{name}: {size}" for name, size in sizes.items())
-            raise OptionError(f"found columns of unequal length ({found}); expected a value of each for every sample.")
+            raise OptionError(
+                f"found columns of unequal length ({found}); expected a value of each for every sample. Fill the "
+                "shorter ones, or give all combinations: sweep({…})."
+            )
         return Samples(tuple(columns), tuple(zip(*columns.values(), strict=True)), None, int(seed))
     if isinstance(rows, str) or not isinstance(rows, Sequence) or not all(isinstance(row, Mapping) for row in rows):
         raise OptionError(
-            f"found {rows!r}; expected a list of samples, such as [{{'controller.gain': 2.0}}], or the values by name."
+            f"found {rows!r}; expected a list of samples, or the values by name. Give "
+            "[{'controller.gain': 2.0}], or {'controller.gain': [2.0]}."
         )
     if not rows:
         raise OptionError("found no sample; expected one at least. Give a row of the table.")
@@ -379,21 +392,24 @@ def read_samples(
 def _check_parameters(parameters: object) -> None:
     if not isinstance(parameters, Mapping) or not parameters:
         raise OptionError(
-            f"found {parameters!r}; expected parameters by name, such as {{'controller.gain': (1.0, 2.0)}}."
+            f"found {parameters!r}; expected parameters by name, with their values. Give "
+            "{'controller.gain': (1.0, 2.0)}."
         )
 
 
 def _list_values(name: str, values: Any) -> tuple[Any, ...]:
     if isinstance(values, str | Mapping | Box) or not isinstance(values, Sequence | np.ndarray):
         raise OptionError(
-            f"found {values!r}; expected a list of its values, such as np.linspace(1.0, 2.0, 5).", block=str(name)
+            f"found {values!r}; expected a list of its values. Give one, such as (1.0, 2.0) or "
+            "np.linspace(1.0, 2.0, 5).",
+            block=str(name),
         )
     found = tuple(_plain(value) for value in values)
     if not found:
         raise OptionError("found no value; expected one at least. Give it.", block=str(name))
     for value in found:
         if isinstance(value, float) and not math.isfinite(value):
-            raise OptionError(f"found the value {value!r}; expected finite numbers.", block=str(name))
+            raise OptionError(f"found the value {value!r}; expected finite numbers. Leave it out.", block=str(name))
     return found
 
 

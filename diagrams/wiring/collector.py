@@ -54,8 +54,8 @@ class Collector:
             if not isinstance(root, Wireable):
                 made = as_block(root, "(u)")
                 raise WiringError(
-                    f"found {shorten(root)}; expected calls of blocks or subsystems, such as plant(force=u)."
-                    + f" {made}." * bool(made)
+                    f"found {shorten(root)}; expected calls of blocks or subsystems. "
+                    + (f"{made}." if made else "Give them after the name: Diagram('loop', plant(force=u)).")
                 )
             self._follow(root, _Root())
             while self.stack:

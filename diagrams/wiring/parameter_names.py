@@ -53,7 +53,8 @@ def check_name(name: object, diagram: str) -> str:
     """Return a name of a parameter; refuse what is no text."""
     if not isinstance(name, str) or not name:
         raise OptionError(
-            f"found {shorten(name)} as the name of a parameter; expected a dotted path, such as 'controller.gain'.",
+            f"found {shorten(name)} as the name of a parameter; expected a text. Give a dotted path, such as "
+            "'controller.gain'.",
             block=diagram,
         )
     return name

@@ -89,7 +89,9 @@ class SubsystemSettings:
             )
         for key, value, allowed in (("enabled", enabled, ENABLED), ("triggered", triggered, TRIGGERED)):
             if value is not None and value not in allowed:
-                raise WiringError(f"found {key}={value!r}; expected {' or '.join(map(repr, allowed))}.", block=path)
+                raise WiringError(
+                    f"found {key}={value!r}; expected {' or '.join(map(repr, allowed))}. Give one of these.", block=path
+                )
         control = "enabled" if enabled else "triggered" if triggered else ""
         given = cls(path, sample_time, method, (), (), offset, delay, control, enabled or triggered or "")  # type: ignore[arg-type]
         return given.checked()
@@ -129,7 +131,7 @@ def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
         time = value if isinstance(value, Fraction) else read_time(float(value))
     except (TypeError, ValueError, OverflowError):
         raise SampleTimeError(
-            f"found the sample time {value!r}; expected seconds, such as 1e-3.", block=block
+            f"found the sample time {value!r}; expected a number of seconds. Give one, such as 1e-3.", block=block
         ) from None
     if float(value) <= 0:
         raise SampleTimeError(
@@ -155,7 +157,8 @@ def _exact_offset(value: SupportsFloat | str, sample_time: Fraction | None, *, b
         raise SampleTimeError("it has an offset but no sample time; give it sample_time=….", block=block)
     if offset >= sample_time:
         raise SampleTimeError(
-            f"found an offset of {float(offset):g} s; expected less than the sample time, {float(sample_time):g} s.",
+            f"found an offset of {float(offset):g} s; expected less than the sample time, {float(sample_time):g} s. "
+            f"Give {float(offset % sample_time):g}, at which the later ticks are as well, or a longer sample time.",
             block=block,
         )
     return offset
@@ -164,7 +167,11 @@ def _exact_offset(value: SupportsFloat | str, sample_time: Fraction | None, *, b
 def _check_delay(value: object, sample_time: Fraction | None, *, block: str) -> int:
     """Return a computational delay in samples, checked."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise SampleTimeError(f"found delay={value!r}; expected a whole number of samples, 0 or more.", block=block)
+        raise SampleTimeError(
+            f"found delay={value!r}; expected a whole number of samples, 0 or more. Give one, such as delay=1; a delay "
+            "in seconds is TransportDelay(delay=…).",
+            block=block,
+        )
     if value and sample_time is None:
         raise SampleTimeError("it has a delay but no sample time; give it sample_time=….", block=block)
     return value

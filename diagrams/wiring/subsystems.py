@@ -121,7 +121,8 @@ class Subsystem(ShownAsTable):
         missing = [name for name in names if name not in given and name not in optional - {self.control_input}]
         if missing:
             raise UnwiredInputError(
-                f"nothing is wired to {', '.join(map(repr, missing))}; expected {self.name}({', '.join(names)}).",
+                f"nothing is wired to {', '.join(map(repr, missing))}; expected {self.name}({', '.join(names)}). Give "
+                "a signal or a number for each.",
                 block=self.name,
                 port=missing[0],
             )

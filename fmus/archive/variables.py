@@ -94,6 +94,8 @@ class FmuVariable:
         least, most = float(np.max(low)), float(np.min(high))
         if np.isfinite(least) and np.isfinite(most):
             return f"{least:g} to {most:g}{unit}"
+        if least == np.finfo(float).tiny:  # an open bound, which FMI can't write
+            return f"numbers above 0{unit}"
         return f"at least {least:g}{unit}" if np.isfinite(least) else f"at most {most:g}{unit}"
 
     @property

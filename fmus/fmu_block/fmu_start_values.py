@@ -64,7 +64,9 @@ def check_state(variable: FmuVariable, value: Any, label: str) -> np.ndarray:
         found = np.array(np.nan)
     if not np.all(np.isfinite(found)):
         raise ParameterError(
-            f"found {value!r}; expected finite numbers of shape {variable.shape}.", block=label, port=variable.name
+            f"found {value!r}; expected finite numbers of shape {variable.shape}. Give these.",
+            block=label,
+            port=variable.name,
         )
     return found
 
@@ -110,7 +112,7 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
     try:
         array = np.array(np.broadcast_to(np.asarray(numbers, dtype=float), variable.shape))
     except (TypeError, ValueError):
-        raise refuse(f"found {value!r}; expected numbers of shape {variable.shape}.") from None
+        raise refuse(f"found {value!r}; expected numbers of shape {variable.shape}. Give these.") from None
     if variable.is_integer and _too_large(numbers):  # before it is rounded
         raise refuse(
             f"found {value!r}; expected at most 2**53 in size, up to which a signal holds every integer of its type "
@@ -118,12 +120,12 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
         )
     if not np.all(np.isfinite(array)):
         unit = f" in {variable.unit}" if variable.unit else ""
-        raise refuse(f"found {value!r}; expected finite numbers{unit}.")
+        raise refuse(f"found {value!r}; expected finite numbers{unit}. Give these.")
     if reason := variable.complaint(array):
         raise refuse(f"{reason}. Give another value.")
     low, high = variable.limits
     if np.any((array < low) | (array > high)):
-        raise refuse(f"found {value!r}; the FMU allows {variable.range_text}.")
+        raise refuse(f"found {value!r}; the FMU allows {variable.range_text}. Give a value in that range.")
     return array
 
 

@@ -104,7 +104,7 @@ def test_an_input_that_is_missing_is_named_and_one_with_a_default_is_not_asked_f
 
 
 def test_a_default_is_no_place_for_an_injection():
-    with pytest.raises(UnknownNameError, match=r"there is no signal 'adds\.b'"):
+    with pytest.raises(UnknownNameError, match=r"there is no signal 'adds\.b' .* Wire a Constant to it"):
         Diagram("d", Adds(name="adds")(Constant(value=1.0))).linearize(inputs="adds.b", step=0.1)
 
 

@@ -534,7 +534,7 @@ def test_files_that_are_no_fmu(command, tmp_path, capsys):
         b"not a zip archive",
         "is no FMU: it is no zip archive (it starts with b'not a zi')",
     )
-    says(zip_files({"a.txt": b""}), "is a zip archive without modelDescription.xml, so it is no FMU.")
+    says(zip_files({"a.txt": b""}), "is a zip archive without modelDescription.xml, so it is no FMU. Give the .fmu")
     says(
         zip_files({"a/modelDescription.xml": b""}),
         "There is a/modelDescription.xml: pack the files in that folder, not the folder.",

@@ -87,7 +87,7 @@ def written_for_this_processor(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("platform", TARGETS)
 def test_all_c_code_compiles_without_a_warning(platform, tmp_path):
-    first = {"linux": b"\x7fELF", "windows": b"MZ", "macos": b"\xcf\xfa\xed\xfe"}  # of libraries for 64 bits
+    first = {"linux": b"\x7fELF", "windows": b"MZ", "darwin": b"\xcf\xfa\xed\xfe"}  # of libraries for 64 bits
     for i, text in enumerate(sources().values()):
         emulated.compile_for(platform, text, tmp_path / f"{i}", *STRICT)
         assert (tmp_path / f"{i}").read_bytes().startswith(first[platform.partition("-")[2]])

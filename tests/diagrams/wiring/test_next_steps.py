@@ -12,12 +12,17 @@ from loopwright import Block, Diagram, Input, State, build, doctor, subsystem
 from loopwright.blocks import (
     PID,
     Encoder,
+    Function,
     Gain,
+    LoopwrightError,
     ParameterError,
+    Recorded,
+    SmoothStep,
     Stack,
     Step,
     TransferFunction,
     TransportDelay,
+    UnitConversion,
     UnitError,
     UnknownNameError,
     WiringError,
@@ -26,8 +31,10 @@ from loopwright.blocks import (
 from loopwright.blocks.core import near, parse_unit
 from loopwright.diagrams import DefinitionError
 from loopwright.diagrams.exporting import make_exported
-from loopwright.fmus import FmuError
+from loopwright.diagrams.sweeps.samples import grid, table
+from loopwright.fmus import Fmu, FmuError, dc_motor
 from loopwright.fmus.fmu_block.fmu_start_values import check_value
+from loopwright.sweeps import Box
 
 
 @subsystem(sample_time=0.01)
@@ -40,6 +47,59 @@ def loop():
     motor = TransferFunction(numerator=[2.0], denominator=[0.1, 1.0], name="motor")
     reference = Step(times=0.1, values=1.0, name="reference")
     return Diagram("loop", motor(controller(reference, motor.y)).named("speed"))
+
+
+NEXT_STEPS = [
+    (
+        lambda: Step(times=(1, 2), values=1.0),
+        r"^step\.times: .* Give lists of one length, such as times=\(0\.5, 2\.0\)",
+    ),
+    (
+        lambda: SmoothStep(levels=(0, 1), start_times=(0, 1), durations=1),
+        r"levels: found 2 levels, 2 .* Give one level",
+    ),
+    (
+        lambda: Recorded(times=(0, 1), values=(1, 2, 3)),
+        r"values of shape \(3,\) for 2 times; .* Give one row of values",
+    ),
+    (lambda: UnitConversion(from_unit="m", to_unit="s"), r"two units of one dimension\. .* Give another unit\.$"),
+    (lambda: Function(abs, arguments=("my a",)), r"arguments: found 'my a'; expected names .* Give these"),
+    (lambda: Gain(gain=1, name="my gain"), r"found the name 'my gain'; .* Take 'my_gain'\."),
+    (lambda: Gain(gain=1, name="2nd"), r"found the name '2nd'; .* Take 'n_2nd'\."),
+    (lambda: Gain(gain=1, name="motor-größe"), r"Take 'motor_größe'\."),
+    (lambda: Gain(gain=1, name="%"), r"Take 'v_perp'\."),
+    (lambda: Gain(gain=1)("r"), r"gain\.u: found 'r'; .* Wire an output by its name, such as plant\.y\."),
+    (lambda: Gain(gain=1)(1.0).named("u")["1"], r"found the index '1'; .* Write y\[0\] or y\[:2\]"),
+    (lambda: Diagram("d", Gain(gain=[[1, 2]])(1.0)), r"found a scalar; .* takes 2 entries\. Wire a signal of as many"),
+    (
+        lambda: Diagram("d", 3),
+        r"found 3; expected calls .* Give them after the name: Diagram\('loop', plant\(force=u\)\)",
+    ),
+    (lambda: subsystem(sample_time="1ms")(abs), r"sample time '1ms'; expected a number of seconds\. Give one"),
+    (
+        lambda: subsystem(sample_time=0.1, offset=0.25)(abs),
+        r"offset of 0\.25 s; .* Give 0\.05, at which the later ticks",
+    ),
+    (lambda: subsystem(sample_time=0.1, delay=0.05)(abs), r"found delay=0\.05; .* delay in seconds is TransportDelay"),
+    (lambda: subsystem(sample_time=0.1, enabled="yes")(abs), r"expected 'held' or 'reset'\. Give one of these"),
+    (lambda: subsystem(lambda a, b: a)(1.0), r"nothing is wired to 'b'; .* Give a signal or a number for each"),
+    (lambda: Box("a", 2.0), r"from 'a' to 2\.0; expected two numbers\. Give \(low, high\), such as"),
+    (lambda: Box(2.0, 1.0), r"the lower one first\. Give \(low, high\), such as"),
+    (lambda: Box([1.0, 2.0], 3.0), r"ends of shapes \(2,\) and \(\); .* Give both ends for each entry"),
+    (lambda: Box.of(5.0, "k.gain"), r"^k\.gain: found 5\.0; expected a range, of two ends\. Give \(low, high\)"),
+    (lambda: grid({"k.gain": 3.0}), r"^k\.gain: found 3\.0; expected a list of its values\. Give one, such as"),
+    (lambda: grid(3.0), r"found 3\.0; expected parameters by name, .* Give \{'controller\.gain': \(1\.0, 2\.0\)\}"),
+    (lambda: grid({"k": (1.0, np.nan)}), r"^k: found the value nan; expected finite numbers\. Leave it out"),
+    (lambda: table({"a": (1.0,), "b": (1.0, 2.0)}), r"unequal length \(a: 1, b: 2\); .* Fill the shorter ones"),
+    (lambda: table("a"), r"found 'a'; expected a list of samples, .* Give \[\{'controller\.gain': 2\.0\}\]"),
+    (lambda: Input(nominal=-1.0), r"found nominal -1\.0; expected a positive number\. Give"),
+]
+
+
+@pytest.mark.parametrize(("ask", "said"), NEXT_STEPS)
+def test_an_everyday_mistake_ends_in_a_next_step(ask, said):
+    with pytest.raises(LoopwrightError, match=said):
+        ask()
 
 
 def test_a_stack_of_two_says_how_to_get_four():
@@ -81,6 +141,15 @@ def test_a_linear_model_says_where_plots_and_margins_are(loop):
 def test_the_beginning_of_a_name_leads_to_it(loop, ask):
     with pytest.raises(UnknownNameError, match="Did you mean 'reference.y'"):
         ask(loop)
+
+
+def test_an_input_leads_to_the_signal_that_feeds_it(loop):
+    with pytest.raises(
+        UnknownNameError, match=r"'u' is an input of 'motor', .* Give 'controller\.pid\.u', which feeds it"
+    ):
+        loop.linearize().loop("motor.u")
+    with pytest.raises(UnknownNameError, match=r"'r' is an input of 'controller\.pid', .* Name the wire that feeds it"):
+        _ = loop.simulate(0.1, progress=False)["pid.r"]
 
 
 def test_only_beginnings_of_three_letters_are_close():
@@ -166,6 +235,11 @@ def test_a_state_that_an_fmu_computes_at_the_start_is_called_a_state():
         check_value(description, "s", 1.0, "fmu")
     with pytest.raises(ParameterError, match=r"^fmu\.start\.v: found a variable that is computed"):
         check_value(description, "v", 1.0, "fmu")
+
+
+def test_the_range_of_a_start_value_that_is_above_0_says_so():
+    with pytest.raises(ParameterError, match=r"found -1\.0; the FMU allows numbers above 0 in Ohm\. Give a value in"):
+        Fmu(dc_motor.build(), start={"resistance": -1.0})
 
 
 def test_an_examination_of_an_fmu_is_a_table_in_a_notebook():
