@@ -52,7 +52,6 @@ class LoopStructure(ctypes.Structure):
         ("truth", ctypes.c_double),
         ("near", ctypes.c_double),
         ("skip", ctypes.c_int64),
-        ("halt", ctypes.c_int32),
         *((name, ctypes.c_void_p) for name in ("loops", "apart", "z", "held")),
         ("inputs", ctypes.c_int64),
         ("own", ctypes.c_void_p),

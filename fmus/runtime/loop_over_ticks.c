@@ -53,7 +53,6 @@ typedef struct {
     double truth;           /* a condition is true above it */
     double near;            /* distance from the end of a step, in steps, within which a time is that end */
     int64_t skip;           /* samples to leave out before the next one that is kept */
-    volatile int32_t halt;  /* not 0: return before the next tick */
     newton *loops;          /* of each kind of tick; NULL: no algebraic loops */
     apart *apart;           /* of FMUs in other processes, or stepped by Python; NULL: there are none */
     const double *z;        /* inputs of all FMUs as they are now */
@@ -281,7 +280,7 @@ static inline int64_t record(loop *l, double t, double *rows, int64_t written) {
 }
 
 /* Whether Python is to have its turn before the next tick. */
-static inline bool is_halted(const loop *l) { return l->halt || (l->apart && l->apart->late); }
+static inline bool is_halted(const loop *l) { return l->apart && l->apart->late; }
 
 static inline bool is_stopped(const loop *l) {
     for (int64_t j = 0; j < l->stops; j++)
