@@ -1,10 +1,11 @@
-"""Layout of a figure with axes in a grid: the room that ticks, labels and legends take, measured once.
+"""Layout of a figure with axes in a grid: the room that ticks, labels and legends take, measured once as a rule.
 
 Matplotlib's constrained layout measures everything twice, which takes most of a figure's time.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 PAD = 0.05
 """Distance from the figure's edge, and half of that between axes, in inches."""
 GUESS = 0.5
-"""Room for ticks and labels in inches with which they are measured: numbers of ticks depend on the size of axes."""
+"""Room for ticks and labels in inches with which they are measured first: ticks depend on the size of axes."""
 
 
 def lay_out(figure: Figure) -> bool:
@@ -24,27 +25,36 @@ def lay_out(figure: Figure) -> bool:
     cells = _cells(figure)
     if not cells:
         return False
-    rows, columns = (1 + max(place[i] for place in cells.values()) for i in (0, 1))
+    rows, columns = shape = 1 + max(row for row, _ in cells.values()), 1 + max(column for _, column in cells.values())
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     legends = [legend.get_tightbbox(renderer) for legend in figure.legends]
     above = max((box.height / figure.dpi for box in legends if box is not None), default=0.0)
     above += PAD if above else 0.0
-    _place(figure, (rows, columns), (GUESS, GUESS, PAD, above + 0.5 * GUESS), (GUESS, GUESS))
-    left, right, bottom, top = ([0.0] * n for n in (columns, columns, rows, rows))
-    for ax, (row, column) in cells.items():
-        ax.apply_aspect()
-        own, whole = ax.get_window_extent(renderer), ax.get_tightbbox(renderer, for_layout_only=True)
-        if whole is None:
-            continue
-        left[column] = max(left[column], (own.x0 - whole.x0) / figure.dpi)
-        right[column] = max(right[column], (whole.x1 - own.x1) / figure.dpi)
-        bottom[row] = max(bottom[row], (own.y0 - whole.y0) / figure.dpi)
-        top[row] = max(top[row], (whole.y1 - own.y1) / figure.dpi)
-    between = max((right[i] + left[i + 1] for i in range(columns - 1)), default=0.0)
-    below = max((bottom[i] + top[i + 1] for i in range(rows - 1)), default=0.0)
-    edges = (left[0] + PAD, bottom[-1] + PAD, right[-1] + PAD, top[0] + above + PAD)
-    _place(figure, (rows, columns), edges, (between + PAD, below + PAD))
+    _place(figure, shape, (GUESS, GUESS, PAD, above + 0.5 * GUESS), (GUESS, GUESS))
+    for _ in range(2):  # again where the axes that come of it have other ticks, of longer numbers
+        ticks = _ticks_of(cells)
+        left, right, bottom, top = ([0.0] * n for n in (columns, columns, rows, rows))
+        for ax, (row, column) in cells.items():
+            ax.apply_aspect()
+            own, whole = ax.get_window_extent(renderer), ax.get_tightbbox(renderer, for_layout_only=True)
+            if whole is None:
+                continue
+            left[column] = max(left[column], (own.x0 - whole.x0) / figure.dpi)
+            right[column] = max(right[column], (whole.x1 - own.x1) / figure.dpi)
+            bottom[row] = max(bottom[row], (own.y0 - whole.y0) / figure.dpi)
+            top[row] = max(top[row], (whole.y1 - own.y1) / figure.dpi)
+        between = max((right[i] + left[i + 1] for i in range(columns - 1)), default=0.0)
+        below = max((bottom[i] + top[i + 1] for i in range(rows - 1)), default=0.0)
+        edges = (left[0] + PAD, bottom[-1] + PAD, right[-1] + PAD, top[0] + above + PAD)
+        _place(figure, shape, edges, (between + PAD, below + PAD))
+        if _ticks_of(cells) == ticks:
+            break
     return True
+
+
+def _ticks_of(cells: Iterable[Axes]) -> list[list[float]]:
+    """Return the places of the ticks of all axes."""
+    return [list(axis.get_majorticklocs()) for ax in cells for axis in (ax.xaxis, ax.yaxis)]
 
 
 def _cells(figure: Figure) -> dict[Axes, tuple[int, int]]:

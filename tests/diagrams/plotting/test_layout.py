@@ -78,3 +78,15 @@ def test_axes_that_stand_in_no_grid_are_left_to_matplotlib():
     figure.set_layout_engine(None)
     assert not lay_out(figure)
     assert [ax.get_position().bounds for ax in figure.axes] == before
+
+
+def test_longer_numbers_that_the_placed_axes_have_room_for_are_measured_as_well():
+    """Ticks at 0, 1 and 2 in the room that was guessed; the axes come out higher, and have 0.0, 0.5, 1.0, …."""
+    with style():
+        figure = new_figure(1.7, WIDTH / 2)
+        ax = figure.subplots()
+        ax.plot([0.0, 6.0], [0.0, 1.5])
+        ax.set(xlabel="time", ylabel="answer")
+    figure.set_layout_engine(None)
+    assert lay_out(figure)
+    assert ax.get_tightbbox(figure.canvas.get_renderer()).x0 >= -SLACK
