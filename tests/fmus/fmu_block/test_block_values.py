@@ -87,10 +87,23 @@ def test_a_file_that_changes_under_a_diagram_is_an_error_when_it_runs(file, othe
     diagram.replace(plant=plant.replace()).simulate(0.01, step=0.01, progress=False)
 
 
+def test_a_file_that_is_looked_for_in_another_folder_is_an_error_that_names_the_folder(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(file.parent)
+    plant = Fmu(file.name)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    with pytest.raises(FmuFileError) as e:
+        loop(plant)
+    assert str(e.value) == (
+        f"fmu: there is no file {file.name!r}; expected an FMU. Check the path. It is relative to the working folder, "
+        f"{str(tmp_path / 'elsewhere')!r}."
+    )
+
+
 def test_a_file_written_again_with_the_same_content_is_the_same(file, built):
     plant = Fmu(file)
     file.unlink()
-    with pytest.raises(FmuFileError, match=r"^fmu: there is no file"):
+    with pytest.raises(FmuFileError, match=r"^fmu: there is no file .*expected an FMU\. Check the path\.$"):
         loop(plant)
     shutil.copyfile(built, file)  # another time stamp
     loop(plant).simulate(0.01, step=0.01, progress=False)
