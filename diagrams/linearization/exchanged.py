@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ...blocks.core import Finding, FmuError, Layout
+from ...blocks.core import Finding, FmuError, Layout, Wanted
 from ...fmus.fmu_block import (
     Derivation,
-    DerivativeMethod,
+    EquationSlopes,
     FmuLinearization,
-    check_exchange_slopes,
-    find_exchange_slopes,
+    LocalEquations,
+    refuse_end,
 )
 from ..flat import Evaluators, FlatDiagram
 from ..model_exchange import ModelExchangeEvaluator
@@ -26,6 +26,7 @@ from ..wiring import join
 from .left_out_effects import CoarseValues, InexactDerivatives, RefutedDerivatives
 
 if TYPE_CHECKING:
+    from ...fmus.calls import ModelExchangeInstance
     from ...fmus.fmu_block import Fmu
 
 
@@ -34,84 +35,58 @@ KEPT = 2**20
 
 
 class PointEvaluator(ModelExchangeEvaluator):
-    """Evaluator of one FMU at an operating point; it notes how its derivatives are computed."""
+    """Evaluator of one FMU at an operating point, whose slopes are those of `EquationSlopes`."""
 
     def __init__(self, flat: FlatDiagram, path: str):
         super().__init__(flat, path)
         self._fmu = cast("Fmu", flat.table.blocks[path])
-        self._inputs = Layout.of(dict(flat.checked.traced[path].inputs))
-        self._wired = [port for port in self._inputs.slices if (path, port) in flat.table.wires]
+        self._wired = [port for port in flat.checked.traced[path].inputs if (path, port) in flat.table.wires]
         self.error = 0.0
         """Largest known error of a derivative so far; 0 where the FMU computes them."""
         self.noise = 0.0
         """The same error, relative to the largest derivative next to it."""
-        exchange = self._fmu.description.exchange
-        directional = exchange is not None and exchange.has_derivatives
-        self.derivation = Derivation(
-            DerivativeMethod.DIRECTIONAL if directional else DerivativeMethod.DIFFERENCES, "model_exchange"
-        )
-        """Method by which the derivatives are computed."""
-        self._checked, self._differenced = set[tuple[str, ...]](), set[tuple[str, ...]]()
         self._derivatives: dict[tuple[object, ...], np.ndarray] = {}
 
-    def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the derivative of `evaluate`; the FMU's own is held against differences where it is asked for first.
+    @cached_property
+    def _slopes(self) -> EquationSlopes:
+        exchange, about = self._fmu.description.exchange, self._fmu.description
+        has_own = exchange is not None and exchange.has_derivatives and bool(about.states or not exchange.state_count)
+        return EquationSlopes("model_exchange", has_own=has_own, is_built_here=self.block.is_built_here)
 
-        Where it is plainly wrong, differences replace it from then on. The last ones are kept: the loops at all
-        wires, and the slopes along all parameters, ask for them at the same instants.
+    @property
+    def derivation(self) -> Derivation:
+        """Method by which the derivatives are computed."""
+        return self._slopes.derivation
+
+    def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of `evaluate` by (t, x, u), NaN by t; None: it has none.
+
+        The last ones are kept: the loops at all wires, and the slopes along all parameters, ask for them at the same
+        instants.
         """
         key = names, t, x.tobytes(), u.tobytes(), self.derivation.refuted
         known = self._derivatives.pop(key, None)
-        made = self._differentiate(names, t, x, u) if known is None else known
+        made = super().differentiate(names, t, x, u) if known is None else known
         if made is not None:
             self._derivatives[key] = made
             if len(self._derivatives) * made.nbytes > KEPT:
                 del self._derivatives[next(iter(self._derivatives))]
         return made
 
-    def _differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        made = super().differentiate(names, t, x, u)
-        if made is None or names in self._checked:
-            return made
-        self._checked.add(names)
-        if names in self._differenced or self.block.is_built_here:
-            return made
-        found = check_exchange_slopes(
-            self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u), x, u, made[:, 1:]
-        )
-        if found.is_wrong:
-            self.derivation = found.describe(self.derivation)
-            return super().differentiate(names, t, x, u)
-        if not self.derivation.gap >= found.gap:
-            self.derivation = found.describe(self.derivation)
-        self._note(float(np.max(found.error, initial=0.0, where=np.isfinite(found.error))), made[:, 1:])
-        return made
-
-    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the FMU's own derivatives; None where they are refuted."""
-        return None if self.derivation.refuted else super().slopes(ports, rates=rates, t=t, x=x, u=u)
-
-    def _note(self, error: float, J: np.ndarray) -> None:
-        self.error = max(self.error, error)
-        if error:
-            self.noise = max(self.noise, error / float(np.max(np.abs(J), initial=error)))
-
-    def differences(
-        self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray, scale: float = 1.0
-    ) -> np.ndarray:
-        """Return the derivative of `evaluate` by (x, u), by differences whose error is estimated."""
-        if x.size and not self._fmu.description.states:  # its states have no names by which they could be moved
-            found = super().differences(names, t, x, u)
-            error = float(np.abs(found - super().differences(names, t, x, u, 2.0)).max(initial=0.0))
-            coarseness = 0.0
+    def find_slopes(self, names: tuple[str, ...], wanted: Wanted, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the derivative of `evaluate` by (x, u), and note its error."""
+        about, block = self._fmu.description, cast("ModelExchangeInstance", self.block)
+        if x.size and not about.states:  # its states have no names by which they could be moved
+            J, coarse = (self.differences(names, t, x, u, scale) for scale in (1.0, 2.0))
+            error = np.abs(J - coarse)
         else:
-            made = find_exchange_slopes(self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u)
-            found, error, coarseness = made.J, float(np.max(made.error, initial=0.0)), made.find_coarseness()
-        self._note(error, found)
-        self._differenced.add(names)
-        worst = max(coarseness, self.derivation.coarseness)
-        self.derivation = replace(self.derivation, method=DerivativeMethod.DIFFERENCES, coarseness=worst)
-        return found
+            equations = LocalEquations.in_exchange(block, wanted, t, x, u)
+            J, error = self._slopes.find(equations, lambda: block.own_slopes(wanted, t, x, u), wanted)
+        worst = float(np.max(error, initial=0.0, where=np.isfinite(error)))
+        self.error = max(self.error, worst)
+        if worst:
+            self.noise = max(self.noise, worst / float(np.max(np.abs(J), initial=worst)))
+        return J
 
 
 _KNOWN: WeakKeyDictionary[OperatingPoint, tuple[FlatDiagram, Mapping[str, PointEvaluator]]] = WeakKeyDictionary()
@@ -183,11 +158,7 @@ def load_evaluators(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, Point
             instance = stack.enter_context(made.exchange(evaluator._wired, start_time=at.t))
             instance.exchange(_inputs_at(flat, at, path))
             instance.begin_exchange()
-            if instance.ends_run:
-                raise FmuError(
-                    f"the FMU asks to end the simulation (terminateSimulation) at t = {at.t:.9g} s, so it has no "
-                    "linear model there. Choose another operating point."
-                )
+            refuse_end(instance, at.t)
         except FmuError as error:
             error.at(block=path)
             raise

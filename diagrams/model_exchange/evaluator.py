@@ -200,14 +200,16 @@ class ModelExchangeEvaluator(Evaluator):
             return None
         # Differences are by states and inputs alone: time can't go back behind an event.
         wanted = sort_names(names)
-        J = self.slopes(wanted.outputs, rates=wanted.rates, t=t, x=x, u=u)
-        if J is None:
-            J = self.differences(names, t, x, u)
+        J = self.find_slopes(names, wanted, t, x, u)
         return np.hstack([np.full((len(J), 1), math.nan), J])
 
-    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the block's own derivative of outputs and rates by (x, u); None: it has none."""
-        return self.block.slopes(ports, rates=rates, t=t, x=x, u=u)
+    def find_slopes(self, names: tuple[str, ...], wanted: Wanted, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the derivative of `evaluate` by (x, u): the block's own, or differences.
+
+        They are for Newton's method within a run. Linear models take those of `PointEvaluator`, whose error is known.
+        """
+        J = self.block.slopes(wanted.outputs, rates=wanted.rates, t=t, x=x, u=u)
+        return self.differences(names, t, x, u) if J is None else J
 
     def differences(
         self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray, scale: float = 1.0

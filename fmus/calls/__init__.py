@@ -6,7 +6,6 @@ from .instance import FmuInstance
 from .library_functions import LibraryFunctions, exported_name, list_prototypes
 from .loaded_fmu import LoadedFmu
 from .loading import FmuSetup
-from .model_exchange_calls import order_questions
 from .model_exchange_instance import ModelExchangeInstance
 from .model_structure import is_smooth
 from .native_calls import NativeAction, NativeLook, NativeStep, QuietStep, RemoteStep, SharedValues
@@ -42,5 +41,4 @@ __all__ = [
     "is_kept",
     "is_smooth",
     "list_prototypes",
-    "order_questions",
 ]

@@ -490,10 +490,6 @@ class FmiCalls(ABC):
         """Enter Continuous-Time Mode."""
         self.fmu.enterContinuousTimeMode()
 
-    def set_continuous_states(self, x: np.ndarray) -> None:
-        """Set all continuous states, in the FMU's order."""
-        self.fmu.setContinuousStates((ctypes.c_double * x.size)(*x), x.size)
-
     def state_derivatives(self, n: int) -> np.ndarray:
         """Return the derivatives of the n continuous states, in the FMU's order."""
         made, name = (ctypes.c_double * n)(), self.table.exchange["derivatives"]

@@ -355,6 +355,36 @@ class LoadedFmu:
         found = self.call("a directional derivative", self.fmi.directional_derivative, *arguments)
         return np.array(found, dtype=float)
 
+    def directional_slopes(
+        self, unknowns: Sequence[FmuVariable], knowns: Sequence[tuple[FmuVariable, bool]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the directional derivatives of all elements of unknowns by those of knowns, at the present values.
+
+        It returns also which rows are known: those of local variables may not be asked for (FMI 2.0, 2.1.9; FMI 3.0,
+        2.2.11). Rows of integers are zero. Those of states are known; some FMUs say that they are zero. Knowns that
+        don't move, by the second part of each pair, have zero columns.
+        """
+        about = self.description
+        states = [about.find_state(v) for v in unknowns]
+        pairs = [*zip(unknowns, states, strict=True)]
+        asked = [not v.is_integer and state is None and about.has_slopes(v) for v, state in pairs]
+        known = [k or v.is_integer or state is not None for k, (v, state) in zip(asked, pairs, strict=True)]
+        sizes = [v.size for v in unknowns]
+        rows = np.repeat(np.array(asked, dtype=bool), sizes)
+        references = [r for v, is_asked in zip(unknowns, asked, strict=True) if is_asked for r in v.references]
+        J, column = np.zeros((rows.size, sum(v.size for v, _ in knowns))), 0
+        for variable, moves in knowns:
+            for k in range(variable.size):
+                if moves and rows.any():
+                    of, by = references, _seeds(variable, k)
+                    purpose = f"the directional derivative by {variable.name}"
+                    J[rows, column] = self.call(purpose, self.fmi.directional_derivative, of, *by, int(rows.sum()))
+                for first, state in zip(np.cumsum([0, *sizes]), states, strict=False):
+                    if state == variable.name and moves:
+                        J[first + k, column] = 1.0
+                column += 1
+        return J, np.repeat(np.array(known, dtype=bool), sizes)
+
     # ---- statuses of its calls, and values that don't fit ----
 
     def judge(self, action: str, status: int, t: float) -> None:
@@ -443,3 +473,10 @@ class LoadedFmu:
         except Exception as error:
             self._note(error)
             self.add_note(f"the run is complete, but the FMU did not end well: {error}")
+
+
+def _seeds(variable: FmuVariable, k: int) -> tuple[list[int], list[float]]:
+    """Return value references and seeds that move one element of a variable."""
+    if len(variable.references) == variable.size:
+        return [variable.references[k]], [1.0]
+    return list(variable.references), np.eye(variable.size)[k].tolist()

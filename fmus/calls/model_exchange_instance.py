@@ -174,55 +174,43 @@ class ModelExchangeInstance(LoadedFmu):
         self._discarded = f"{actions[-1]} at t = {t:.9g} s{self.quote_messages().rstrip('.')}"
         into[:] = math.nan
 
+    def compute(self, wanted: Wanted, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return a copy of the values of an `evaluation`; where the FMU can't compute them that is an error."""
+        self._discarded = ""
+        found = self.evaluation(wanted)(t, x, u).copy()
+        if self._discarded:
+            raise self.report(f"{self._discarded}, where its slopes are computed:", DISCARD, t)
+        return found
+
+    def rows(self, wanted: Wanted) -> list[FmuVariable]:
+        """Return the variables of an `evaluation` without indicators: outputs, then the derivatives of the states."""
+        outputs = [self.setup.output_variables[port] for port in wanted.outputs]
+        return [*outputs, *(self.description.find(name) for name in self.description.states.values() if wanted.rates)]
+
     @property
     def discarded(self) -> str:
         """The last evaluation that the FMU could not compute; empty if there is none."""
         return self._discarded
 
     def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the derivative of an `evaluation` by (x, u); None if the FMU computes no directional derivatives.
+        """Return the derivative of an `evaluation` by (x, u); None if the FMU can't be asked for all of it."""
+        found = self.own_slopes(Wanted(tuple(ports), rates), t, x, u)
+        return found[0] if found is not None and found[1].all() else None
 
-        Those of local variables may not be asked for (FMI 2.0, 2.1.9; FMI 3.0, 2.2.11). Those of states are known; some
-        FMUs say that they are zero.
+    def own_slopes(
+        self, wanted: Wanted, t: float, x: np.ndarray, u: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the directional derivatives of an `evaluation` by (x, u), and which rows the FMU may be asked for.
+
+        None if it computes none. Columns of inputs that are not set in Continuous-Time Mode are zero.
         """
         about = self.description
         if not self.about.has_derivatives or (self._x.size and not about.states):
             return None
-        outputs = [self.setup.output_variables[port] for port in ports]
-        states = [about.find_state(v) for v in outputs]
-        asked = [
-            v.type == "Float64" and state is None and about.has_slopes(v)
-            for v, state in zip(outputs, states, strict=True)
-        ]
-        if any(
-            v.type == "Float64" and not a and name is None for v, a, name in zip(outputs, asked, states, strict=True)
-        ):
-            return None
-        self.evaluation(Wanted(tuple(ports), rates))(t, x, u)
-        unknown = [*outputs, *(about.find(name) for name in about.states.values() if rates)]
-        asked += [True] * (len(unknown) - len(asked))
-        smooth = [v for v, is_asked in zip(unknown, asked, strict=True) if is_asked]
-        parts = (np.full(v.size, is_asked) for v, is_asked in zip(unknown, asked, strict=True))
-        rows = np.concatenate([np.zeros(0, dtype=bool), *parts])
-        J = np.zeros((rows.size, x.size + u.size))
-        first, where = 0, about.layout(about.states).slices
-        for v, name in zip(outputs, states, strict=True):
-            if name is not None:
-                J[first : first + v.size, where[name]] = np.eye(v.size)
-            first += v.size
-        column = 0
-        known = [(about.find(name), True) for name in about.states]
-        known += [(v, port in self._smooth and v.type == "Float64") for port, v in self._ports.items()]
-        references = [r for v in smooth for r in v.references]
-        count = sum(v.size for v in smooth)
-        for variable, moves in known:
-            for k in range(variable.size):
-                if moves and count:
-                    refs, seed = seeds(variable, k)
-                    purpose = f"the directional derivative by {variable.name}"
-                    J[rows, column] = self.call(purpose, self.fmi.directional_derivative, references, refs, seed, count)
-                column += 1
-        return J
+        self.evaluation(wanted)(t, x, u)
+        knowns = [(about.find(name), True) for name in about.states]
+        knowns += [(v, port in self._smooth) for port, v in self._ports.items()]
+        return self.directional_slopes(self.rows(wanted), knowns)
 
     # ---- the start ----
 
@@ -235,10 +223,18 @@ class ModelExchangeInstance(LoadedFmu):
 
     def begin_exchange(self) -> np.ndarray:
         """Leave Initialization Mode, settle the events at the start, and return the continuous states."""
+        self.begin()
+        return self.settle()
+
+    def begin(self) -> None:
+        """Leave Initialization Mode."""
         if self._limited:
             self.check_limits(self._fill(self.u, self._began), self._began)
-        self.begin()
+        super().begin()
         self._time.value = self._began
+
+    def settle(self) -> np.ndarray:
+        """Settle the events at the start, and return the continuous states."""
         x = self._iterate(self._began, self.fmi.initialized)
         self.nominals = self._read_nominals()
         self.begin_texts(self._began)
@@ -518,10 +514,3 @@ class ModelExchangeInstance(LoadedFmu):
             raise self.report(action, status, t)
         self._judge_evaluation(status, [action], t, np.zeros(0))
         self._check_computed(t)
-
-
-def seeds(variable: FmuVariable, k: int) -> tuple[list[int], list[float]]:
-    """Return value references and seeds that move one element of a variable."""
-    if len(variable.references) == variable.size:
-        return [variable.references[k]], [1.0]
-    return list(variable.references), np.eye(variable.size)[k].tolist()

@@ -313,7 +313,7 @@ class Fmu(PortMembers):
         (Continuous-Time Mode), in co-simulation (Step Mode); differences in model exchange, in co-simulation
         (Initialization Mode). The clauses are FMI 2.0, 2.1.9, 3.2.3, 4.2.4, and FMI 3.0, 2.2.11, 2.3.3, 3.2, 4.2. It
         loads its own instance. Discrete states and parameters are constant. Directional derivatives of an FMU
-        of others are held against differences, used instead where they are plainly wrong (``derivation.refuted``).
+        of others are held against differences, used instead if some are plainly wrong (``derivation.refuted``).
 
         Parameters
         ----------
@@ -343,7 +343,8 @@ class Fmu(PortMembers):
         ParameterError, UnknownNameError
             For an operating point with unknown names or wrong values.
         """
-        return linear_model(setup_of(self), t, state, inputs, interface, exact)
+        # all inputs are set at every evaluation, so that no slope rests on the dependencies that the FMU declares
+        return linear_model(setup_of(self.replace(dependencies=DEPENDENCIES[1])), t, state, inputs, interface, exact)
 
     def step_difference(
         self, h: float, *, t: float = 0.0, state: Any = None, inputs: Any = None, relative_step: float = STEP

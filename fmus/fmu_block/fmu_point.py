@@ -21,7 +21,7 @@ from ...blocks.core import (
     explain_calls,
     near,
 )
-from ..calls import FmuInstance, FmuSetup, LoadedFmu, is_kept
+from ..calls import FmuInstance, FmuSetup, LoadedFmu, ModelExchangeInstance, is_kept
 from .derivation import Derivation
 from .fmu_start_values import check_state, check_value
 
@@ -191,10 +191,20 @@ class FmuPoint:
         )
 
 
+def refuse_end(instance: ModelExchangeInstance, t: float) -> None:
+    """Refuse an operating point at whose events the FMU asks to end the simulation, at the time t in s."""
+    if instance.ends_run:
+        raise FmuError(
+            f"the FMU asks to end the simulation (terminateSimulation) at t = {t:.9g} s, so it has no linear model "
+            "there. Choose another operating point.",
+            block=instance.setup.label,
+        )
+
+
 @contextmanager
-def initialize_in_exchange(point: FmuPoint) -> Iterator[LoadedFmu]:
+def initialize_in_exchange(point: FmuPoint) -> Iterator[ModelExchangeInstance]:
     """Load the FMU for model exchange, and enter Initialization Mode at the operating point."""
-    instance = LoadedFmu(point.setup, model_exchange=True)
+    instance = ModelExchangeInstance(point.setup, [*point.setup.input_variables])
     try:
         point.initialize(instance)
         yield instance

@@ -6,24 +6,31 @@ against differences, or differences. A communication step has differences alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError, ParameterError, accepts, kinds
+from ...blocks.core import FmuError, ParameterError, Wanted, accepts, kinds
 from ...blocks.tracing import extrapolate
-from ..calls import FmuInstance, FmuSetup, LoadedFmu, order_questions
+from ..archive import FmuVariable
+from ..calls import FmuInstance, FmuSetup, ModelExchangeInstance, is_smooth
 from .derivation import Derivation, DerivativeMethod
-from .difference_quotients import Column, Differences, differentiate
-from .fmu_point import FmuLinearization, FmuPoint, initialize_in_exchange, initialize_to_step, step_from, take_step
+from .difference_quotients import Column, differentiate
+from .exchange_slopes import EQUATIONS, EquationSlopes, LocalEquations, real_elements
+from .fmu_point import (
+    FmuLinearization,
+    FmuPoint,
+    initialize_in_exchange,
+    initialize_to_step,
+    refuse_end,
+    step_from,
+    take_step,
+)
 from .restored_point import RestoredPoint
-from .slope_check import SlopeCheck, check_slopes
 
-EQUATIONS = 1e-5
-"""Relative distance of differences of equations."""
 STEP = 1e-4
 """Relative distance of differences of steps, which an adaptive solver makes less smooth than equations."""
 
@@ -57,10 +64,8 @@ def linear_model(
     )
     for exchange, derived, possible in ways:
         if possible and exact in (None, derived) and interface in (None, _interface_name(exchange)):
-            with initialize_in_exchange(point) if exchange else initialize_to_step(point) as instance:
-                return (
-                    _linearize_by_directions(point, instance) if derived else _linearize_by_differences(point, instance)
-                )
+            linearize = _linearize_in_exchange if exchange else _linearize_before_steps
+            return linearize(point, derived=derived)
     raise FmuError(
         f"it can't be linearized in this way (interface={interface!r}, exact={exact!r}): it has "
         f"{'' if about.model_exchange else 'no '}model exchange, directional derivatives "
@@ -75,206 +80,149 @@ def _interface_name(exchange: bool) -> str:
     return "model_exchange" if exchange else "co_simulation"
 
 
-def _enter_continuous_time(point: FmuPoint, instance: LoadedFmu) -> None:
-    """Settle the events at the start, then set the states that initialization computes (FMI 3.0, 3.2).
+def _linearize_in_exchange(point: FmuPoint, *, derived: bool) -> FmuLinearization:
+    """Linearize by model exchange in Continuous-Time Mode; by discrete inputs and parameters in Event Mode."""
+    with initialize_in_exchange(point) as instance:
+        x = _enter_continuous_time(point, instance)
+        u, wanted = instance.values(point.inputs), Wanted(tuple(point.setup.output_variables), rates=True)
+        values = instance.compute(wanted, point.t, x, u)
+        x = instance.values(point.states)  # some FMUs don't take states that are set
+        point.check(x, exchange=True)
+        slopes = EquationSlopes("model_exchange", has_own=derived, is_built_here=instance.is_built_here)
+        equations = LocalEquations.in_exchange(instance, wanted, point.t, x, u)
+        J, error = slopes.find(equations, lambda: instance.own_slopes(wanted, point.t, x, u), wanted)
+        instance.compute(wanted, point.t, x, u)  # what follows is at the point, not where a difference has ended
+        derivation = _find_event_columns(point, instance, slopes.derivation, instance.rows(wanted), J, error)
+    rates = np.arange(values.size) >= values.size - x.size
+    order = np.concatenate([np.flatnonzero(rates), np.flatnonzero(~rates)])
+    return point.model(J[order], x, u, values[order], h=None, derivation=derivation, uncertainty=error[order])
 
-    They are those without an exact start value, and those that have lost theirs before any event: initial equations
-    of a model may override what its description calls exact, as in FMUs of OpenModelica.
+
+def _enter_continuous_time(point: FmuPoint, instance: ModelExchangeInstance) -> np.ndarray:
+    """Settle the events at the start; return the states, with those that initialization computes as they were given.
+
+    They are those without an exact start value, and those that have lost theirs before any event (FMI 3.0, 3.2):
+    initial equations of a model may override what its description calls exact, as in FMUs of OpenModelica.
     """
+    instance.u = instance.values(point.inputs)
     instance.begin()
     computed = point.lost(instance.values(point.states))
-    found = instance.call("the events at the start", instance.fmi.iterate_events)
-    if found.terminate:
-        raise FmuError(
-            f"the FMU asks to end the simulation (terminateSimulation) at t = {point.t:.9g} s, in an event there, so "
-            "it has no linear model there. Choose another operating point.",
-            block=point.setup.label,
-        )
-    if found.again:
-        raise FmuError(
-            "the events at the start don't settle in 100 rounds. Choose another operating point.",
-            block=point.setup.label,
-        )
-    instance.call("entering Continuous-Time Mode", instance.fmi.enter_continuous_time_mode)
-    guessed = [
-        n for n in point.states if n in point.given and (n in computed or point.about.find(n).initial != "exact")
-    ]
-    if guessed:
-        x = instance.values(point.states)
-        where = point.about.layout(point.states).slices
-        for name in guessed:
+    x = instance.settle()
+    refuse_end(instance, point.t)
+    where = point.about.layout(point.states).slices
+    for name in point.states:
+        if name in point.given and (name in computed or point.about.find(name).initial != "exact"):
             x[where[name]] = np.ravel(point.given[name])
-        _set_states(point, instance, x)
+    return x
 
 
-def _set_states(point: FmuPoint, instance: LoadedFmu, x: np.ndarray) -> None:
-    """Set all continuous states in model exchange."""
-    in_order = x[np.array(point.about.state_order, dtype=int)]
-    instance.call("setting the continuous states", instance.fmi.set_continuous_states, in_order)
+def _find_event_columns(
+    point: FmuPoint,
+    instance: ModelExchangeInstance,
+    derivation: Derivation,
+    rows: Sequence[FmuVariable],
+    J: np.ndarray,
+    error: np.ndarray,
+) -> Derivation:
+    """Write slopes by inputs that only an event takes over (FMI 2.0, 3.2.3; FMI 3.0, 2.2.11); return their method.
 
-
-def _values(point: FmuPoint, instance: LoadedFmu) -> np.ndarray:
-    """Return the derivatives of the states and the outputs.
-
-    In model exchange the FMU's function for derivatives is asked: their variables may be those of an earlier call.
+    Discrete states stay: no round of the event iteration is taken before the values are read.
     """
-    order = np.array(point.about.state_order, dtype=int)
-    rates = [point.about.states[n] for n in point.states]
-    if not instance.model_exchange or len(order) != point.about.layout(point.states).total:
-        return instance.values([*rates, *point.outputs])
-    found = {"rates": np.zeros(order.size)}
+    about, n = point.about, sum(point.about.find(name).size for name in point.states)
+    where = about.layout(point.inputs).slices
 
-    def read() -> None:
-        found["values"] = instance.values(point.outputs or rates)
+    def evaluate(name: str, moved: np.ndarray) -> np.ndarray:
+        with _event_mode(instance):
+            before = instance.values([name])
+            try:
+                instance.set_values({name: moved})
+                return _read(instance, rows)
+            finally:
+                instance.set_values({name: before})
 
-    def derive() -> None:
-        found["rates"][order] = instance.call("computing the derivatives", instance.fmi.state_derivatives, order.size)
-
-    for ask in order_questions([read], [derive], [read]):
-        ask()
-    return np.concatenate([found["rates"], found["values"] if point.outputs else np.zeros(0)])
-
-
-def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLinearization:
-    """Linearize by directional derivatives in Continuous-Time or Step Mode, for discrete inputs in Event Mode."""
-    if instance.model_exchange:
-        _enter_continuous_time(point, instance)
-    else:
-        instance.begin()
-    about = point.about
-    x, u = instance.values(point.states), instance.values(point.inputs)
-    point.check(x, exchange=instance.model_exchange)
-    values = _values(point, instance)
-    unknowns = [*(about.states[n] for n in point.states), *point.outputs]
-    variables = [about.find(n) for n in unknowns]
-    asked = [not v.is_integer and about.has_slopes(v) and about.find_state(v) is None for v in variables]
-    smooth = [n for n, is_asked in zip(unknowns, asked, strict=True) if is_asked]
-    found = []
-    for name in (*point.states, *point.moved):
-        with _mode_of(point, instance, name):
-            size = about.find(name).size
-            found += [instance.directional_derivative(smooth, [name], seed) for seed in np.eye(size).tolist()]
-    sizes = [about.find(n).size for n in unknowns]
-    rows = np.repeat(asked, sizes)
-    part = np.zeros((values.size, len(found)))
-    part[rows] = np.array(found).reshape(len(found), -1).T if found else 0.0
-    derivation = Derivation(DerivativeMethod.DIRECTIONAL, _interface_name(instance.model_exchange))
-    uncertainty = np.zeros(part.shape)
-    if not instance.is_built_here:
-        checked = _check(point, instance, part[rows], rows)
-        part[rows], uncertainty[rows] = checked.J, checked.error
-        derivation = checked.describe(derivation)
-    others = point.smooth(unknowns) & ~rows
-    first, where = 0, about.layout(point.states).slices
-    for name, size in zip(unknowns, sizes, strict=True):
-        state = about.find_state(about.find(name))
-        if state is not None and others[first]:
-            part[first : first + size, where[state]] = np.eye(size)
-            others[first : first + size] = False
-        first += size
-    if others.any():  # local variables
-        if not instance.model_exchange:
-            _initialize_again(point, instance)
-        found_too = _differences(point, instance, values)
-        part[others], uncertainty[others] = found_too.J[others], found_too.error[others]
-        derivation = replace(derivation, coarseness=found_too.find_coarseness(others))
-    J = point.widen(part)
-    return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=point.widen(uncertainty))
+    for name in point.moved:
+        if is_smooth(about.find(name)):
+            continue
+        columns = slice(n + where[name].start, n + where[name].stop)
+        known = np.zeros(len(J), dtype=bool)
+        if derivation.method is DerivativeMethod.DIRECTIONAL:
+            with _event_mode(instance):
+                J[:, columns], known = instance.directional_slopes(rows, [(about.find(name), True)])
+        if (others := real_elements(rows) & ~known).any():
+            column, values = Column(about, [name], instance.values([name]), EQUATIONS), _read(instance, rows)
+            made = differentiate(column, values, evaluate)
+            J[others, columns], error[others, columns] = made.J[others], made.error[others]
+            worst = max(derivation.coarseness, made.find_coarseness(others))
+            derivation = replace(derivation, coarseness=worst)
+    return derivation
 
 
-def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray) -> SlopeCheck:
-    """Hold directional derivatives against differences, in Continuous-Time Mode, or in Initialization Mode again.
+def _read(instance: ModelExchangeInstance, rows: Sequence[FmuVariable]) -> np.ndarray:
+    """Return the values of outputs and rates without setting anything.
 
-    Discrete inputs of model exchange are left out: to move them is an event.
+    The FMU's function for derivatives is asked: their variables may be those of an earlier call.
     """
-    about, names = point.about, [*point.states, *point.moved]
-    variables = [about.find(name) for name in names]
-    moved = [
-        np.full(v.size, not instance.model_exchange or v.name in point.states or v.variability == "continuous")
-        for v in variables
-    ]
-    layout = about.layout(names)
-
-    def values(moved: np.ndarray) -> np.ndarray:
-        parts = layout.split(moved)
-        if instance.model_exchange:
-            _set_states(point, instance, moved[: sum(about.find(n).size for n in point.states)])
-            parts = {n: part for n, part in parts.items() if about.find(n).variability == "continuous"}
-            parts = {n: part for n, part in parts.items() if n in point.moved}
-        instance.call("setting its values", instance.set_values, parts)
-        return np.asarray(_values(point, instance)[rows])
-
-    try:
-        at = np.concatenate([instance.values(point.states), instance.values(point.moved)])
-        if not instance.model_exchange:
-            _initialize_again(point, instance)
-    except FmuError:
-        return SlopeCheck(J, np.full(J.shape, np.nan), np.nan, is_wrong=False)
-    limits = [np.concatenate([np.ravel(v.limits[side]) for v in variables]) for side in (0, 1)]
-    nominals = np.concatenate([np.ravel(v.nominals) for v in variables])
-    found = check_slopes(J, values, at, nominals, (limits[0], limits[1]), np.concatenate(moved))
-    with suppress(FmuError):
-        values(at)  # further derivatives are those of the point, not of where the check has ended
-    return found
-
-
-def _initialize_again(point: FmuPoint, instance: LoadedFmu) -> None:
-    """Go back to Initialization Mode at the operating point."""
-    instance.reset()
-    point.initialize(instance)
+    about = instance.description
+    order, n = np.array(about.state_order, dtype=int), about.layout(about.states).total
+    instance.read_variables(rows)  # the order of questions holds for all FMUs: values, derivatives, values again
+    if order.size != n:
+        return instance.read_variables(rows)
+    rates = instance.call("computing the derivatives", instance.fmi.state_derivatives, n)
+    values = instance.read_variables(rows)
+    values[len(values) - n + order] = rates
+    return values
 
 
 @contextmanager
-def _mode_of(point: FmuPoint, instance: LoadedFmu, name: str) -> Iterator[None]:
-    """Enter Event Mode for a discrete input or a parameter of model exchange, and leave it again.
-
-    Clauses are FMI 2.0, 3.2.3, and FMI 3.0, 2.2.11.
-    """
-    discrete = instance.model_exchange and point.about.find(name).variability in ("discrete", "tunable")
-    if discrete:
-        instance.call("entering Event Mode", instance.fmi.enter_event_mode)
+def _event_mode(instance: ModelExchangeInstance) -> Iterator[None]:
+    """Enter Event Mode, and leave it again."""
+    instance.call("entering Event Mode", instance.fmi.enter_event_mode)
     yield
-    if discrete:
-        instance.call("the events", instance.fmi.update_events)
-        instance.call("entering Continuous-Time Mode", instance.fmi.enter_continuous_time_mode)
+    instance.call("the events", instance.fmi.update_events)
+    instance.call("entering Continuous-Time Mode", instance.fmi.enter_continuous_time_mode)
 
 
-def _linearize_by_differences(point: FmuPoint, instance: LoadedFmu) -> FmuLinearization:
-    """Linearize by differences in Continuous-Time Mode or Initialization Mode (FMI 3.0, 3.2 and 2.3.3)."""
-    if instance.model_exchange:
-        _enter_continuous_time(point, instance)
-    x, u = instance.values(point.states), instance.values(point.inputs)
-    point.check(x, exchange=instance.model_exchange)
-    values = _values(point, instance)
-    made = _differences(point, instance, values)
-    J, uncertainty = point.widen(made.J), point.widen(made.error)
-    interface = _interface_name(instance.model_exchange)
-    coarseness = made.find_coarseness(point.smooth([*point.states, *point.outputs]))
-    derivation = Derivation(DerivativeMethod.DIFFERENCES, interface, coarseness=coarseness)
-    return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=uncertainty)
+def _linearize_before_steps(point: FmuPoint, *, derived: bool) -> FmuLinearization:
+    """Linearize by co-simulation: its own slopes in Step Mode, differences in Initialization Mode (FMI 3.0, 2.3.3)."""
+    about = point.about
+    with initialize_to_step(point) as instance:
+        if derived:
+            instance.begin()
+        x, u = instance.values(point.states), instance.values(point.inputs)
+        point.check(x, exchange=False)
+        names = [*point.states, *point.inputs]
+        rows = [about.find(name) for name in (*about.states.values(), *point.outputs)]
+        layout = about.layout(names)
+        moved = [(about.find(name), layout.slices[name]) for name in (*point.states, *point.moved)]
+        near = _NearTheStart(point, instance, [v.name for v, _ in moved], np.concatenate([x, u]), rows)
+        equations = LocalEquations(about, near.at, moved, near.evaluate, real_elements(rows))
+        values = instance.read_variables(rows)
+        slopes = EquationSlopes("co_simulation", has_own=derived, is_built_here=instance.is_built_here)
+        knowns = [(about.find(name), name in near.names) for name in names]
+        J, error = slopes.find(equations, lambda: instance.directional_slopes(rows, knowns), "linear model")
+    return point.model(J, x, u, values, h=None, derivation=slopes.derivation, uncertainty=error)
 
 
-def _differences(point: FmuPoint, instance: LoadedFmu, values: np.ndarray) -> Differences:
-    """Return the derivatives of `_values` by states and inputs, by differences."""
-    x = instance.values(point.states)
-    at = np.concatenate([x, instance.values(point.moved)])
-    column = Column(point.about, [*point.states, *point.moved], at, EQUATIONS)
+class _NearTheStart:
+    """Values of an FMU's equations with states and inputs moved in Initialization Mode, before its first step."""
 
-    def move(name: str, to: np.ndarray) -> None:
-        if instance.model_exchange and name in point.states:
-            _set_states(point, instance, to[: x.size])
-        else:
-            instance.set_values({name: column.part(name, to)})
+    def __init__(
+        self, point: FmuPoint, instance: FmuInstance, names: list[str], at: np.ndarray, rows: Sequence[FmuVariable]
+    ):
+        self.point, self.instance, self.names, self.at, self.rows = point, instance, names, at, rows
+        self._layout = point.about.layout([*point.states, *point.inputs])
+        self._set = self._layout.split(at)
 
-    def evaluate(name: str, moved: np.ndarray) -> np.ndarray:
-        with _mode_of(point, instance, name):
-            try:
-                move(name, moved)
-                return _values(point, instance)
-            finally:
-                move(name, column.at)
-
-    return differentiate(column, values, evaluate)
+    def evaluate(self, at: np.ndarray) -> np.ndarray:
+        """Return the values of the rows; only what has changed is set."""
+        if self.instance.is_running:  # it is in Step Mode
+            self.instance.reset()
+            self.point.initialize(self.instance)
+        parts = self._layout.split(at)
+        changed = {n: parts[n] for n in self.names if not np.array_equal(parts[n], self._set[n])}
+        self.instance.call("setting its values", self.instance.set_values, changed)
+        self._set = parts
+        return self.instance.read_variables(self.rows)
 
 
 # --- a communication step ---------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization.exchanged import PointEvaluator
 from loopwright.diagrams.requirements import Limit, Reason, Verdict, judge
 from loopwright.fmus import Fmu, FmuError
+from loopwright.fmus.fmu_block import DerivativeMethod
 from loopwright.frequency import margins
 from loopwright.types import InexactDerivatives, RefutedDerivatives
 from support.misstated import A, B, misstated_fmu
@@ -148,6 +149,22 @@ def test_local_variables_as_ports_have_slopes_though_the_fmu_may_not_be_asked_fo
     kp = np.array([[0.0, 0.0], [0.0, 0.0]]) - 4.0 * exact[:, 2:] @ [[1.0, 0.0]]
     np.testing.assert_allclose(linear.A[np.ix_(own, own)], exact[:, :2] + kp, atol=1e-8)
     assert linear.uncertainty < 1e-6
+    if interface == "model_exchange":  # differences of what it may not be asked for, of nothing else
+        assert linear.derivations["plant"].method is DerivativeMethod.DIRECTIONAL
+
+
+@pytest.mark.parametrize("e", [0.0, 5e-9, -2.0])
+def test_a_diagram_has_the_slopes_of_its_fmu_by_itself(file3, e):
+    """The same method, and the same bits: both ask one place."""
+    plant = Fmu(file3, interface="model_exchange", name="plant", start={"e": e, **POINT})
+    model = plant.linear_model(inputs={"u": 3.0})
+    linear = Diagram("pushed", plant(u=Constant(value=3.0, name="force"))).linearize(0.0, inputs="force.y")
+    assert linear.states == ("plant.x", "plant.v")
+    np.testing.assert_array_equal(linear.A, model.A)
+    np.testing.assert_array_equal(linear.B, model.B)
+    assert linear.uncertainty == np.max(model.uncertainty[:2])
+    assert linear.derivations["plant"] == model.derivation
+    np.testing.assert_allclose(model.A, A, rtol=0.0, atol=2e-6)
 
 
 def test_a_run_begins_at_the_start_itself_though_no_state_can_be_set_there(tmp_path):
