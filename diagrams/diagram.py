@@ -112,7 +112,14 @@ class Diagram(ShownAsTable):
             )
         if not roots:
             raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
-        self._hold(WiredDiagram(check_name(name), Collector(roots).structure(), loops, type(self)))
+        structure = Collector(roots).structure()
+        if not structure.blocks:
+            raise WiringError(
+                "found no block in what it is made of; expected one at least. Call blocks in the subsystem's function, "
+                "and return their signals.",
+                block=name,
+            )
+        self._hold(WiredDiagram(check_name(name), structure, loops, type(self)))
 
     @classmethod
     def from_ssp(

@@ -252,10 +252,24 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     made = as_block(value, "(…)")
     raise WiringError(
         f"found {shorten(value)}; expected a signal, a call, a block with one output, finite numbers, or a list of "
-        "these. " + (f"{made}." if made else "Wire an output by its name, such as plant.y."),
+        "these. " + (f"{made}." if made else _other_than(value)),
         block=block,
         port=port,
     )
+
+
+def _other_than(value: Any) -> str:
+    """Return the next step for what is no signal."""
+    if value is None:
+        return "Let the function that made it return a signal."
+    if isinstance(value, bool | np.bool_):
+        return f"Give {float(value):g} for a logic signal."
+    if isinstance(value, str):
+        with suppress(ValueError):
+            return f"Leave out the quotes: {float(value):g}."
+    if isinstance(value, int | float | np.number | np.ndarray | list | tuple):
+        return "Give finite numbers; missing samples are to be filled first."
+    return "Wire an output by its name, such as plant.y."
 
 
 def _stack(values: Any, block: str, port: str) -> Signal:

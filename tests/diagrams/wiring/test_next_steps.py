@@ -69,6 +69,11 @@ NEXT_STEPS = [
     (lambda: Gain(gain=1, name="motor-größe"), r"Take 'motor_größe'\."),
     (lambda: Gain(gain=1, name="%"), r"Take 'v_perp'\."),
     (lambda: Gain(gain=1)("r"), r"gain\.u: found 'r'; .* Wire an output by its name, such as plant\.y\."),
+    (lambda: Gain(gain=1)(None), r"found None; .* Let the function that made it return a signal"),
+    (lambda: Gain(gain=1)("1.5"), r"found '1\.5'; .* Leave out the quotes: 1\.5\."),
+    (lambda: Gain(gain=1)(np.nan), r"found nan; .* Give finite numbers"),
+    (lambda: Gain(gain=1)(True), r"found True; .* Give 1 for a logic signal"),
+    (lambda: Diagram("d", subsystem(lambda: ())()), r"^d: found no block .* Call blocks in the subsystem's function"),
     (lambda: Gain(gain=1)(1.0).named("u")["1"], r"found the index '1'; .* Write y\[0\] or y\[:2\]"),
     (lambda: Diagram("d", Gain(gain=[[1, 2]])(1.0)), r"found a scalar; .* takes 2 entries\. Wire a signal of as many"),
     (
