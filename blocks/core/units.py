@@ -265,13 +265,15 @@ def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
     a, b = _read(a), _read(b)
     if same_unit(a, b):
         return f"{a.text} and {b.text} are the same"
+    plain = all(_is_read_alike(unit) for unit in (a, b))
+    between = f"put UnitConversion(from_unit={a.text!r}, to_unit={b.text!r}) between" if plain else ""
+    remedy = f"give both in {b.base_text}"
     if _same_exponents(a, b) and _is_open(a, b):
         unclear, other = (a, b) if a.relative is None else (b, a)
         return (
             f"{unclear.text} and {other.text} differ by an offset for temperatures, and by none for differences, and "
             "the signal may be either (as a sum of two temperatures, or one less a number without a unit): give all "
-            f"that is added a unit, or put UnitConversion(from_unit={a.text!r}, to_unit={b.text!r}) between if it is a "
-            "temperature"
+            f"that is added a unit{', or ' + between + ' if it is a temperature' if between else ''}"
         )
     if not same_dimension(a, b):
         both = f"{a.text} ({a.base_text}) and {b.text} ({b.base_text})"
@@ -280,8 +282,8 @@ def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
         factor, offset = convert_unit(a, b)
         if factor != 1.0:
             law = f"{b.text} = {factor:.12g} · {a.text} + {offset:.12g}".replace("+ -", "- ")
-            return f"{a.text} and {b.text} differ by a factor and an offset, {law}: give both in {b.base_text}"
-        return f"{a.text} and {b.text} differ by an offset of {offset:.12g}: give both in {b.base_text}"
+            return f"{a.text} and {b.text} differ by a factor and an offset, {law}: {between or remedy}"
+        return f"{a.text} and {b.text} differ by an offset of {offset:.12g}: {between or remedy}"
     gain = f"{a.factor / b.factor:.12g}"
     return f"{a.text} and {b.text} differ by a factor of {gain}: put Gain(gain={gain}) between"
 
@@ -376,12 +378,17 @@ def raise_unit(text: str, exponent: float) -> str | None:
     return whole if whole is None or ratio.denominator == 1 else root_unit(whole, ratio.denominator)
 
 
+def _is_read_alike(unit: Unit) -> bool:
+    """Whether a unit's name means the same without its definition, which only an FMU may have."""
+    try:
+        return same_unit(_parse(unit.text), replace(unit, relative=False))
+    except UnitError:
+        return False
+
+
 def _symbol_powers(unit: Unit) -> list[tuple[str, int]]:
     """Return the symbols of a unit with their powers; a name that is defined elsewhere is one symbol."""
-    try:
-        if not same_unit(_parse(unit.text), replace(unit, relative=False)):
-            return [(unit.text, 1)]
-    except UnitError:
+    if not _is_read_alike(unit):
         return [(unit.text, 1)]
     return [(symbol, power) for symbol, power in _powers(unit.text) if symbol != "1"]
 
@@ -397,7 +404,7 @@ def _write_unit(factors: list[tuple[str, int]]) -> str:
 
 
 _WRITTEN = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_PRINTED = {"1": "", "deg": "°"}
+_PRINTED = {"1": "", "deg": "°", "degC": "°C"}
 
 
 def print_unit(text: str) -> str:

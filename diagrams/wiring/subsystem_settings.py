@@ -131,7 +131,7 @@ def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
         time = value if isinstance(value, Fraction) else read_time(float(value))
     except (TypeError, ValueError, OverflowError):
         raise SampleTimeError(
-            f"found the sample time {value!r}; expected a number of seconds. Give one, such as 1e-3.", block=block
+            f"found the sample time {value!r}; expected seconds. Give a number, such as 1e-3.", block=block
         ) from None
     if float(value) <= 0:
         raise SampleTimeError(

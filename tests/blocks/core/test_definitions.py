@@ -63,7 +63,7 @@ def value(block, *u):
             ((2,),),
             r"gain\.u: found shape \(2,\); the gain is a matrix of 2 × 3 and takes 3",
         ),
-        (Gain(gain=np.ones((2, 3))), ((),), r"gain\.u: found shape \(\); the gain is a matrix of 2 × 3 and takes 3"),
+        (Gain(gain=np.ones((2, 3))), ((),), r"gain\.u: found a scalar; the gain is a matrix of 2 × 3 and takes 3"),
         (Saturation(limit=(1, 2)), ((3,),), r"saturation\.u: found shape \(3,\) next to limit of shape \(2,\)"),
     ],
 )

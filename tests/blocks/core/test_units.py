@@ -130,7 +130,9 @@ def test_describes_a_mismatch():
     assert describe_mismatch("N", "m") == (
         "N (kg.m.s-2) and m (m) are of different dimensions: check which ports are meant"
     )
-    assert "offset of 273.15" in describe_mismatch("degC", "K")
+    assert describe_mismatch("degC", "K") == (
+        "degC and K differ by an offset of 273.15: put UnitConversion(from_unit='degC', to_unit='K') between"
+    )
     assert describe_mismatch("N.m", "J") == "N.m and J are the same"
 
 
@@ -217,5 +219,5 @@ def test_powers_conversions_and_print():
     assert [root_unit("m2/s2", 2), root_unit("m", 2), combine_units(("m", 1), ("mm", -1))] == ["m/s", None, "m/mm"]
     assert convert_unit("°C", "K") == (1.0, 273.15)
     assert describe_mismatch("mm", "m") == "mm and m differ by a factor of 0.001: put Gain(gain=0.001) between"
-    assert [*map(print_unit, ("N.s/m", "m/s2", "deg", "1"))] == ["N·s/m", "m/s²", "°", ""]
+    assert [*map(print_unit, ("N.s/m", "m/s2", "deg", "degC", "1"))] == ["N·s/m", "m/s²", "°", "°C", ""]
     assert [with_unit("t", "s"), with_unit("|S|", "1")] == ["t [s]", "|S|"]

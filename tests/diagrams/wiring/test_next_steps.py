@@ -80,7 +80,7 @@ NEXT_STEPS = [
         lambda: Diagram("d", 3),
         r"found 3; expected calls .* Give them after the name: Diagram\('loop', plant\(force=u\)\)",
     ),
-    (lambda: subsystem(sample_time="1ms")(abs), r"sample time '1ms'; expected a number of seconds\. Give one"),
+    (lambda: subsystem(sample_time="1ms")(abs), r"sample time '1ms'; expected seconds\. Give a number"),
     (
         lambda: subsystem(sample_time=0.1, offset=0.25)(abs),
         r"offset of 0\.25 s; .* Give 0\.05, at which the later ticks",
