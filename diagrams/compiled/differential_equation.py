@@ -45,7 +45,7 @@ class DifferentialEquation:
     Attributes
     ----------
     structure : ProblemStructure
-        It as C knows it; valid as long as this lives.
+        It as C knows it, to be copied into the struct of the loop; what it leads to lives as long as this.
     trial : list of ndarray
         The vectors (t, x, w, p) of a trial.
     """

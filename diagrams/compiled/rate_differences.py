@@ -114,7 +114,8 @@ class SlopesByDifferences(FunctionInC):
 
     def hand_over(self, to: Any) -> None:
         """Let generated code of the same function take over."""
-        self.rates.hand_over(to.rates)
+        if self.values:  # the rates whose slope it is are among a diagram's functions, which are handed over themselves
+            self.rates.hand_over(to.rates)
 
 
 def find_columns(part: PartProgram, continuous: np.ndarray) -> Columns:
