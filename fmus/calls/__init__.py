@@ -1,9 +1,9 @@
 """FMI calls into a library that is loaded in this process or in another one."""
 
-from .bound_calls import BoundCalls, Call
-from .fmi_calls import ERROR, WARNING, FmiCalls, Log
+from .bound_calls import BoundCalls
+from .fmi_calls import ERROR, WARNING
 from .instance import FmuInstance
-from .library_functions import LibraryFunctions, exported_name, list_prototypes
+from .library_functions import LibraryFunctions, list_prototypes
 from .loaded_fmu import LoadedFmu
 from .loading import FmuSetup
 from .model_exchange_instance import ModelExchangeInstance
@@ -19,14 +19,11 @@ __all__ = [
     "NEAR",
     "WARNING",
     "BoundCalls",
-    "Call",
-    "FmiCalls",
     "FmuInstance",
     "FmuSetup",
     "FmuState",
     "LibraryFunctions",
     "LoadedFmu",
-    "Log",
     "ModelExchangeInstance",
     "NativeAction",
     "NativeLook",
@@ -37,7 +34,6 @@ __all__ = [
     "StepOptions",
     "StepTime",
     "check_offered",
-    "exported_name",
     "is_kept",
     "is_smooth",
     "list_prototypes",

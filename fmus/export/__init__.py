@@ -10,13 +10,12 @@ from .merged_plants import MergedPlant, PlacedPlant
 from .model_spec import INTEGRATORS, Integrator, ModelSpec, Variable, check_ascii
 from .own_sources import inline_model, own_functions, read_own_sources
 from .python_fmu import build_python
-from .scalar_operations import Lookup, split_lookups
+from .scalar_operations import split_lookups
 from .target_code import write_target
 from .target_files import TargetCode, write_c
-from .target_measure import PROCESSORS, ProcessorMeasurement, TargetMeasurement, measure, run_here
+from .target_measure import ProcessorMeasurement, TargetMeasurement, measure, run_here
 from .target_members import Number
 from .target_spec import CLOCK_LIMIT, BlockOutput, Kept, TargetNumbers, TargetSpec, TargetTick
-from .target_text import TargetText
 from .tick_text import TickFacts
 from .tuning import describe_processor, processor_flags, tune
 from .written_equations import WrittenEquations, read_equations
@@ -24,7 +23,6 @@ from .written_equations import WrittenEquations, read_equations
 __all__ = [
     "CLOCK_LIMIT",
     "INTEGRATORS",
-    "PROCESSORS",
     "ROOM_FOR_EDGES",
     "BlockOutput",
     "CFunction",
@@ -33,7 +31,6 @@ __all__ = [
     "Guards",
     "Integrator",
     "Kept",
-    "Lookup",
     "LoopMemory",
     "LoopSlopes",
     "LoopSpec",
@@ -47,7 +44,6 @@ __all__ = [
     "TargetMeasurement",
     "TargetNumbers",
     "TargetSpec",
-    "TargetText",
     "TargetTick",
     "TickFacts",
     "Variable",
