@@ -5,7 +5,7 @@ from .end_reasons import describe_memory
 from .fmu_process import ChildProcess, ChildRequest
 from .pool import count_processes, end_idle, give_back, take
 from .process_limits import Isolation, default_memory
-from .wire import WATCH_TEXTS
+from .shared_memory import WATCH_TEXTS
 
 __all__ = [
     "WATCH_TEXTS",

@@ -1,8 +1,8 @@
 """The child: calls functions of an FMU's library, as it is asked.
 
 It imports the standard library only, to start quickly. It reads frames from its command pipe, and numbers of bound
-sequences from the shared words (`wire`). All that the FMU writes to its standard output goes to a file, and its log
-messages to another one, so that they are there after a crash.
+sequences from the shared words (`shared_memory`). All that the FMU writes to its standard output goes to a file, and
+its log messages to another one, so that they are there after a crash.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from . import wire
+from . import shared_memory
 from .callbacks import InputLines, log_and_memory
-from .in_c import TYPES, Server, make_watch
-from .surroundings import forget, has_room, kill_group, limit, look_around, move, print_to, resident
-from .wire import (
+from .child_in_c import TYPES, Server, make_watch
+from .shared_memory import (
     CAUSE,
     CHILD_SLEEPS,
     MAIL,
@@ -39,6 +38,7 @@ from .wire import (
     STATUS,
     WAKE,
 )
+from .surroundings import forget, has_room, kill_group, limit, look_around, move, print_to, resident
 
 _LOOKS = 4000
 _PERIOD = 0.25  # s between two looks at memory and output
@@ -75,7 +75,7 @@ class Child:
     def serve(self) -> None:
         """Answer requests until the parent is gone."""
         words, sequences, last = self.words, self.sequences, 0
-        get, patience = words.__getitem__, wire.Patience(_LOOKS, may=self.about["watches"])
+        get, patience = words.__getitem__, shared_memory.Patience(_LOOKS, may=self.about["watches"])
         while True:
             if self.server is not None:
                 if not self.server.wait(last):
@@ -83,7 +83,7 @@ class Child:
             else:
                 for _ in range(patience.looks):
                     if get(REQUEST) != last:
-                        patience.pause = wire.FEWEST
+                        patience.pause = shared_memory.FEWEST
                         break
                 else:
                     patience.slept()
@@ -97,7 +97,7 @@ class Child:
             else:
                 sequences[get(SEQUENCE)]()
             words[REPLY] = last
-            wire.order_memory()
+            shared_memory.order_memory()
             if words[PARENT_SLEEPS] or not self.ordered:
                 os.write(self.replies, WAKE)
 
@@ -105,7 +105,7 @@ class Child:
         """Sleep until there is a request, or a byte of an earlier one."""
         words = self.words
         words[CHILD_SLEEPS] = 1
-        wire.order_memory()
+        shared_memory.order_memory()
         if (words[REQUEST] == last or not self.ordered) and not os.read(self.commands, 4096):
             self.leave()
         words[CHILD_SLEEPS] = 0
@@ -141,7 +141,7 @@ class Child:
     def _answer(self) -> None:
         """Do what the message in the mailbox says, and put the result there."""
         memory, words, file = self.memory, self.words, self.about["mail"]
-        (operation, *arguments), blobs = wire.read_message(memory, words, file)
+        (operation, *arguments), blobs = shared_memory.read_message(memory, words, file)
         try:
             result, data = getattr(self, f"do_{operation}")(*arguments, blobs=blobs)
         except Exception as error:
@@ -149,7 +149,7 @@ class Child:
         else:
             succeeded = True
         self._leave_copy()
-        wire.write_message(memory, words, file, [succeeded, result], data)
+        shared_memory.write_message(memory, words, file, [succeeded, result], data)
 
     # ---- operations ----
 
@@ -233,7 +233,7 @@ class Child:
                     made.append((value[0], TYPES[value[0]].from_buffer(self.memory, value[1])))
                 else:
                     made.append((kind, TYPES[kind](value)))
-            function = make_watch() if name == wire.WATCH_TEXTS else self.library[name]
+            function = make_watch() if name == shared_memory.WATCH_TEXTS else self.library[name]
             function.restype = ctypes.c_int
             bound.append((function, made))
         self.bound.append(bound)
@@ -293,10 +293,10 @@ class Child:
         if not status:
             return
         with self._logging:
-            if self.words[MESSAGES] < wire.MOST_MESSAGES and self.logged < wire.MOST_LOGGED:
-                data = text.encode(errors="replace")[: wire.LONGEST_MESSAGE]
+            if self.words[MESSAGES] < shared_memory.MOST_MESSAGES and self.logged < shared_memory.MOST_LOGGED:
+                data = text.encode(errors="replace")[: shared_memory.LONGEST_MESSAGE]
                 self.logged += len(data)
-                os.write(self.log, wire.LOG_HEAD.pack(status, len(data)) + data)
+                os.write(self.log, shared_memory.LOG_HEAD.pack(status, len(data)) + data)
                 self.words[MESSAGES] += 1
 
     def _callbacks(self, version: int) -> Any:

@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 
 from ...blocks.core import FmuEnd
-from .wire import MEMORY, NO_ROOM, OUTPUT
+from .shared_memory import MEMORY, NO_ROOM, OUTPUT
 
 _BY_US = -int(getattr(signal, "SIGKILL", signal.SIGTERM))
 _NEARLY = 0.8  # part of the memory that counts as all of it

@@ -21,9 +21,9 @@ import numpy as np
 
 from ...blocks.core import FmuEnd, FmuError, FmuProcessError, describe_disk_error
 from ..child_processes import ProcessGroup, find_python, make_temporary_folder, remove_folder
-from . import wire
+from . import shared_memory
 from .end_reasons import read_end
-from .wire import (
+from .shared_memory import (
     CAUSE,
     CHILD_SLEEPS,
     DATA,
@@ -78,8 +78,8 @@ class ChildProcess:
         self._peak = 0
         self._output = ChildOutput(self.folder)
         self.number, self._allotted = 0, DATA
-        self._watches = wire.ORDERED and _count_cores() > 1
-        self.patience = wire.Patience(_LOOKS, may=self._watches)
+        self._watches = shared_memory.ORDERED and _count_cores() > 1
+        self.patience = shared_memory.Patience(_LOOKS, may=self._watches)
         self._names: list[list[str]] = []
         self._call = ""
         self._process: subprocess.Popen[bytes] | None = None
@@ -111,7 +111,7 @@ class ChildProcess:
             "memory": self.memory_limit,
             "output": self.output_limit,
             "watches": self._watches,
-            "ordered": wire.ORDERED,
+            "ordered": shared_memory.ORDERED,
             "files": str(self.folder / "fmu"),
             **{name: str(self.folder / name) for name in ("shared", "log", "printed", "mail")},
         }
@@ -179,11 +179,11 @@ class ChildProcess:
         self._call = call
         self.check_alive(call)
         memory, words, file = self._memory, self.words, str(self.folder / "mail")
-        wire.write_message(memory, words, file, [operation, *arguments], blobs)
+        shared_memory.write_message(memory, words, file, [operation, *arguments], blobs)
         self.post(MAIL)
         self.finish(MAIL, seconds)
         try:
-            (succeeded, result), data = wire.read_message(memory, words, file)
+            (succeeded, result), data = shared_memory.read_message(memory, words, file)
         except (OSError, ValueError, struct.error) as error:  # the FMU has written over it
             self._fail(call, error=error)
         if not succeeded:
@@ -204,14 +204,14 @@ class ChildProcess:
             self.check_alive(self._place_name(sequence))
         words[SEQUENCE] = sequence
         words[REQUEST] = self.number = self.number + 1
-        wire.order_memory()
-        if words[CHILD_SLEEPS] or not wire.ORDERED:
+        shared_memory.order_memory()
+        if words[CHILD_SLEEPS] or not shared_memory.ORDERED:
             self.wake(sequence)
 
     def wake(self, sequence: int) -> None:
         """Wake the child, which sleeps."""
         try:
-            os.write(self._in, wire.WAKE)
+            os.write(self._in, shared_memory.WAKE)
         except OSError as error:
             self._fail(self._place_name(sequence), error=error)
 
@@ -221,7 +221,7 @@ class ChildProcess:
         try:
             for _ in range(patience.looks):
                 if get(REPLY) == number:
-                    patience.pause = wire.FEWEST
+                    patience.pause = shared_memory.FEWEST
                     break
             else:
                 patience.slept()
@@ -245,7 +245,7 @@ class ChildProcess:
         if os.name != "posix":
             return None
         looks = _LOOKS if self._watches else 0
-        return ChildRequest(self, sequence, self._base, self._in, self._out, wire.ORDERED, looks)
+        return ChildRequest(self, sequence, self._base, self._in, self._out, shared_memory.ORDERED, looks)
 
     def run_in_c(self, library: str) -> None:
         """Let the child wait for requests and make bound calls in C, by a library, where it can."""
@@ -267,8 +267,8 @@ class ChildProcess:
         """Sleep until the reply is there."""
         words, deadline = self.words, time.monotonic() + seconds
         words[PARENT_SLEEPS] = 1
-        wire.order_memory()
-        arrived = wire.ORDERED  # else the byte in the pipe says that the reply is written
+        shared_memory.order_memory()
+        arrived = shared_memory.ORDERED  # else the byte in the pipe says that the reply is written
         while words[REPLY] != number or not arrived:
             if _is_readable(self._poll, self._out, _LOOK):
                 arrived = True

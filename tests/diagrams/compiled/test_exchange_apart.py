@@ -66,7 +66,7 @@ def test_events_of_every_kind_are_those_of_this_process(cache, tmp_path, fmi):
 @pytest.mark.slow
 def test_it_works_where_memory_is_not_written_in_order(mass, monkeypatch):
     end_idle()
-    monkeypatch.setattr("loopwright.fmus.isolation.wire.ORDERED", False)
+    monkeypatch.setattr("loopwright.fmus.isolation.shared_memory.ORDERED", False)
     run = mass_loop(mass, True).simulate(0.1, compile=True, **EXACT)
     np.testing.assert_allclose(run["plant.position"], exact_loop(101), rtol=0.0, atol=1e-9)
 

@@ -107,7 +107,7 @@ def test_they_step_at_the_same_time(folder, meeting):
 def test_it_works_where_memory_is_not_written_in_order(folder, monkeypatch):
     """There every request and reply is announced by a byte in a pipe; so it is for replies that Python takes."""
     end_idle()
-    monkeypatch.setattr("loopwright.fmus.isolation.wire.ORDERED", False)
+    monkeypatch.setattr("loopwright.fmus.isolation.shared_memory.ORDERED", False)
     run = simulate(loop(zoo(zoo_fmu(folder, 3))), 1.0, True)
     assert np.allclose(1.0 - run["plant.y"], 0.98 ** np.arange(101), atol=ROUNDED)
     warned = simulate(loop(zoo(zoo_fmu(folder, 3, "step warning 0.5"))), 1.0, True)

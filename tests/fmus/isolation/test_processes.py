@@ -63,7 +63,7 @@ def test_numbers_are_bit_for_bit_those_in_process(msd, fmi):
 def test_it_works_where_memory_is_not_written_in_order(folder, monkeypatch):
     """There every request and reply is announced by a byte in a pipe, as on ARM."""
     end_idle()
-    monkeypatch.setattr("loopwright.fmus.isolation.wire.ORDERED", False)
+    monkeypatch.setattr("loopwright.fmus.isolation.shared_memory.ORDERED", False)
     run = simulate(zoo_fmu(folder, 3), duration=1.0)
     assert np.allclose(run["plant.y"], run.t, atol=1e-12)
     with pytest.raises(FmuProcessError, match="SIGSEGV"):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from . import wire
+from . import shared_memory
 
 TYPES: dict[str, Any] = {
     t._type_: t
@@ -96,8 +96,8 @@ class Server:
             replies=replies,
             ordered=ordered,
             most=looks,
-            left=wire.FEWEST,
-            pause=wire.FEWEST,
+            left=shared_memory.FEWEST,
+            pause=shared_memory.FEWEST,
         )
         self._kept: list[Any] = []
         self._sequences = (_Sequence * 0)()
