@@ -13,7 +13,7 @@ from .diagram_code import (
     write_code,
 )
 from .event_domains import Domains
-from .events_in_c import Fired, Pile
+from .events_in_c import Pile
 from .expanded_functions import LARGEST, ExpandedFunctions
 from .exported_memory import NamedCode, function_text, read_memory
 from .fused import FusedPlant, compile_fused, fuse
@@ -28,7 +28,7 @@ from .loop_over_time import (
     Sign,
     Span,
 )
-from .model_exchange_in_c import ModelExchangeHandOver, NativeModelExchange, OwnEvent
+from .model_exchange_in_c import ModelExchangeHandOver, NativeModelExchange
 from .newton import NewtonOptions
 from .plants_called_back import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
 from .transport_delays import Delays, delays_of
@@ -46,7 +46,6 @@ __all__ = [
     "DiagramCode",
     "Domains",
     "ExpandedFunctions",
-    "Fired",
     "FusedPlant",
     "Kernel",
     "Lost",
@@ -56,7 +55,6 @@ __all__ = [
     "NativeModelExchange",
     "NewtonOptions",
     "Outcome",
-    "OwnEvent",
     "Pile",
     "PythonStep",
     "ReturnReason",

@@ -11,7 +11,7 @@ from .block_start_values import (
     values_from_left,
 )
 from .bound_loops import bind_hybrid, bind_ticks
-from .continuous import Continuous
+from .continuous import Continuous, find_late, next_instant
 from .engine import Engine
 from .failed_blocks import START_SETTLED
 from .held_inputs import note_held_inputs
@@ -20,7 +20,6 @@ from .live_run import LiveRun
 from .progress import Interrupted, ProgressOption, late_progress, progress_bar, work_notes
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
 from .simulation import Simulation, simulate
-from .solver_setup import find_late, next_instant
 from .start_at_point import apply_point, copy_states
 from .stops import StopConditions
 from .view import SimulationView

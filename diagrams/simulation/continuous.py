@@ -6,32 +6,22 @@ The loop lands on discontinuities of sources ahead. Coupled plants may go back o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, FmuRuntimeError, OptionError, ParameterError, SimulationError
+from ...blocks.core import Block, FmuRuntimeError, OptionError, ParameterError, SimulationError, identity
 from ..compiled import Domains, MethodOptions, delays_of
 from ..coupling import accept_steps, try_steps
-from ..flat import FlatDiagram, announcers, renumber
+from ..flat import Announcer, FlatDiagram, Times, announcers, renumber
 from ..model_exchange import BlocksInModelExchange, OwnEvents
 from ..results import Occurrence
 from ..solvers import METHODS, Method, MethodKind, Problem
 from .block_start_values import domains_from_left
 from .failed_blocks import state_values
-from .solver_setup import (
-    absolute_tolerances,
-    find_late,
-    has_guards,
-    longest_step,
-    next_instant,
-    remembers,
-    scales_of,
-    time_scale_of,
-)
 from .workspace import Workspace
 
 _AT_ONCE = 1e-6
@@ -68,7 +58,7 @@ class Continuous:
         """Relative and absolute tolerance."""
         self._loops = flat.active_loops(NOTHING)
         self.delays = delays_of(flat)
-        time_scale = time_scale_of(flat)
+        time_scale = _time_scale_of(flat)
         shortest = math.inf if self.delays is None else self.delays.shortest
         self.method = Method(
             solver,
@@ -76,7 +66,7 @@ class Continuous:
             rtol=rtol,
             atol=absolute_tolerances(flat, atol),
             step=float(flat.base),
-            max_step=longest_step(flat, max_step, time_scale, shortest),
+            max_step=_longest_step(flat, max_step, time_scale, shortest),
         )
         self.fixed = self.method.fixed
         multistep = any(METHODS[name].kind is MethodKind.LIBRARY for name in self.method.names)
@@ -131,7 +121,7 @@ class Continuous:
     def accepts(self, *, judged: bool, plants: bool = False, exchanged: bool = False) -> int:
         """Return after which steps blocks are evaluated (`CompiledHybrid`); ``judged``: outputs may be non-finite."""
         judged = judged and not self.fixed
-        always = plants or self.workspace.looped or remembers(self.flat) or has_guards(self.flat)
+        always = plants or self.workspace.looped or remembers(self.flat) or _has_guards(self.flat)
         return 1 if always or (judged and not exchanged) else 2 if judged else 0
 
     def begin(self, *, at_start: bool) -> None:
@@ -283,7 +273,7 @@ class Continuous:
 
     def fits(self, old: Mapping[str, Block], new: Mapping[str, Block]) -> bool:
         """Whether it fits variants of some blocks, by path: no tolerance and no limit of a step changes with them."""
-        return self.delays is None and all(scales_of(block) == scales_of(old[path]) for path, block in new.items())
+        return self.delays is None and all(_scales_of(block) == _scales_of(old[path]) for path, block in new.items())
 
     def begin_again(self, flat: FlatDiagram) -> None:
         """Forget the run before: another one begins, with other numbers of the diagram."""
@@ -393,3 +383,78 @@ class ContinuousPart:
             for event in self._events:
                 self._report(event)
             self._events.clear()
+
+
+def _time_scale_of(flat: FlatDiagram) -> float:
+    """Return the shortest time within which a source in a continuous subsystem changes."""
+    table = flat.table
+    paths = (p for p in flat.checked.traced if not table.is_sampled(table.subsystem_of[p]))
+    return min((float(table.blocks[p].time_scale()) for p in paths), default=math.inf)
+
+
+def remembers(flat: FlatDiagram) -> bool:
+    """Whether a block in a continuous subsystem has a memory, such as a projection's last foot point."""
+    table = flat.table
+    return any(table.blocks[p].memory and not table.is_sampled(table.subsystem_of[p]) for p in flat.checked.traced)
+
+
+def _has_guards(flat: FlatDiagram) -> bool:
+    """Whether a block in a continuous subsystem has guards, which are looked at after every step."""
+    table, traced = flat.table, flat.checked.traced
+    return any(traced[p].guards and not table.is_sampled(table.subsystem_of[p]) for p in traced)
+
+
+def absolute_tolerances(flat: FlatDiagram, atol: float, nominals: np.ndarray | None = None) -> Any:
+    """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value."""
+    # ``nominals`` are those of the entries of x whose blocks declare none.
+    scale = np.ones(flat.width) if nominals is None else nominals.copy()
+    for path, own in flat.states.of_block.items():
+        for name, where in own.slices.items():
+            nominal = flat.table.blocks[path].states[name].nominal
+            if nominal is not None:
+                scale[where] = nominal
+    scale = scale[flat.continuous]
+    return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
+
+
+def _longest_step(flat: FlatDiagram, max_step: float | None, time_scale: float, shortest_delay: float) -> float | None:
+    """Return the longest step of a solver in s: that asked for, or what memories, sources and delays allow."""
+    longest = max_step
+    if longest is None and remembers(flat):
+        longest = float(flat.base)  # memory is renewed at accepted steps, and must not grow stale
+    if longest is None and time_scale < math.inf:
+        longest = 5.0 * time_scale  # else a step may fit whole periods of a source
+    if shortest_delay < math.inf:
+        longest = min(longest or math.inf, shortest_delay)
+    return longest
+
+
+def find_late(sources: Sequence[tuple[str, Announcer]]) -> dict[float, float]:
+    """Return the instants in s at which sources are seen at a time just after, and that time."""
+    return {t: after for _, one in sources if isinstance(one, Times) for t, after in one.late.items()}
+
+
+def next_instant(path: str, block: Announcer, t: float) -> float:
+    """Return the next instant of a block; one that does not come after t would keep the run where it is."""
+    try:
+        found = block.next_instant(t)
+        later = found > t
+    except Exception as error:
+        raise SimulationError(
+            f"its next_instant({t!r}) failed: {type(error).__name__}: {error}. Expected a time after that, or math.inf "
+            "if there is none.",
+            block=path,
+            t=t,
+        ) from error
+    if not later:
+        raise SimulationError(
+            f"its next_instant({t!r}) is {found!r}; expected a time after that, or math.inf if there is none.",
+            block=path,
+            t=t,
+        )
+    return found
+
+
+def _scales_of(block: Block) -> object:
+    """Return what a block contributes to tolerances and to the limit of a step."""
+    return block.time_scale(), [identity(port.nominal) for port in block.states.values()]

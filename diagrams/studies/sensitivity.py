@@ -40,8 +40,7 @@ from ..linearization import (
 )
 from ..plotting import BLUE, DARK, VERMILION, shown_figure
 from ..results import OperatingPoint
-from .loop_places import place_loops
-from .numbers import compared_numbers, write_open_loop
+from .loop_places import compared_numbers, place_loops, write_open_loop
 from .varied_parameters import changed_entry, check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:

@@ -29,9 +29,8 @@ from ..requirements import REQUIREMENTS, Requirements
 from ..sweeps import Box, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmed_cases import RunConfirmation, confirm_case
-from .loop_places import OtherCuts, place_loops
+from .loop_places import OtherCuts, place_loops, write_open_loop
 from .measures import ContactMeasure, FunctionMeasure, Measure
-from .numbers import write_open_loop
 from .varied_parameters import check_parameters, check_ranges, read_boxes
 from .worst_case_plot import plot_cases
 from .worst_case_search import Study

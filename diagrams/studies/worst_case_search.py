@@ -24,9 +24,8 @@ from ..linearization import (
 from ..results import OperatingPoint
 from ..sweeps import Box
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe
-from .loop_places import OtherCuts, numbers_at_other_cuts
+from .loop_places import OtherCuts, numbers_at_other_cuts, numbers_of
 from .measures import Measure
-from .numbers import numbers_of
 from .varied_parameters import Ranges
 
 if TYPE_CHECKING:

@@ -175,7 +175,7 @@ def test_a_spring_that_the_position_pulls_on_acts_within_the_step(files, fmi):
 @pytest.mark.one_tier
 def test_ticks_ask_neither_the_description_nor_the_sources_anew(files, monkeypatch):
     """Inputs that a sampled subsystem makes jump at every tick: an event each time, and nothing is looked up for it."""
-    from loopwright.diagrams.simulation import continuous, solver_setup
+    from loopwright.diagrams.simulation import continuous
 
     asked = []
 
@@ -184,7 +184,7 @@ def test_ticks_ask_neither_the_description_nor_the_sources_anew(files, monkeypat
         monkeypatch.setattr(module, name, lambda *arguments, **more: asked.append(name) or plain(*arguments, **more))
 
     count(continuous, "absolute_tolerances")
-    count(solver_setup, "next_instant")
+    count(continuous, "next_instant")
     plant = Fmu(files[mass_spring_damper, 3], interface="model_exchange", name="plant")
 
     @subsystem(sample_time=0.01)
@@ -194,4 +194,4 @@ def test_ticks_ask_neither_the_description_nor_the_sources_anew(files, monkeypat
     loop = plant(force=controller(plant.position) + Sine(frequency=0.5, name="wave"))
     Diagram("sampled", loop).simulate(1.0, progress=False)
     assert asked.count("absolute_tolerances") <= 2
-    assert asked.count("next_instant") <= 2
+    assert asked.count("next_instant") <= 5  # one for each call of C, which goes over many of the 100 ticks
