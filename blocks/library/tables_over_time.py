@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -26,6 +27,8 @@ from ..core import (
     shorten,
 )
 from .piecewise_functions import piecewise
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 class _Table(Source):
@@ -148,7 +151,10 @@ class Recorded(_Table):
             For values that are no numbers, and times that don't rise.
         """
         file = Path(path).expanduser()
-        with explain_disk_errors(f"{str(path)!r} can't be read", file, "Name another file.", OptionError, port="path"):
+        step = "Name another file."
+        if file.is_dir():
+            step = 'A run in a folder is played by run = Run.open(path), Recorded(times=run.t, values=run["y"]).'
+        with explain_disk_errors(f"{str(path)!r} can't be read", file, step, OptionError, port="path"):
             text = file.read_text(encoding="utf-8-sig")
         head = text.partition("\n")[0]
         separator = max(",;\t", key=head.count)
@@ -158,16 +164,27 @@ class Recorded(_Table):
                 f"{str(path)!r} is empty; expected a line of names, then numbers. Name another file.", port="path"
             )
         names, *rows = lines
+        own = parameters.get("name") or cls.__name__
+        if all(_NUMBER.fullmatch(name) for name in names):
+            raise ParameterError(
+                f"found the numbers {', '.join(names)} in the first line of {str(path)!r}; expected names of the "
+                f"columns. Put a line above them, such as {separator.join(['t', 'y', *names[2:]][: len(names)])}.",
+                block=own,
+                port="values",
+            )
         table: dict[str, list[float]] = {name: [] for name in names}
         for number, row in enumerate(rows, 2):
             try:
                 for name, cell in zip(names, row, strict=True):
                     table[name].append(float(cell))
             except ValueError:
+                step = "Leave other rows out."
+                if separator != "," and any(_NUMBER.fullmatch(cell.replace(",", ".")) for cell in row if "," in cell):
+                    step = "Write decimal points, or read it with pandas.read_csv(…, decimal=',') and from_pandas."
                 raise ParameterError(
                     f"found the row {number} of {str(path)!r}, {shorten(row)}; expected {len(names)} numbers, one for "
-                    "each name in its first line. Leave other rows out.",
-                    block=parameters.get("name") or cls.__name__,
+                    f"each name in its first line. {step}",
+                    block=own,
                     port="values",
                 ) from None
         return cls._from_columns(table, columns, time or names[0], parameters)

@@ -73,9 +73,14 @@ class ReportKind(Generic[C]):
 
     def check_keys(self, keys: Iterable[str]) -> None:
         """Refuse keys of sections that it doesn't have."""
+        if isinstance(keys, str):
+            raise OptionError(f"found {keys!r}; expected a list of sections. Write only=[{keys!r}].", port="only")
         for key in keys:
             if key not in self.keys:
-                raise OptionError(f"there is no section {key!r}; expected some of {', '.join(self.keys)}.", port="only")
+                raise OptionError(
+                    f"there is no section {key!r}; expected some of {', '.join(self.keys)}. Name these.",
+                    port="only",
+                )
 
     def sections(
         self,

@@ -79,6 +79,8 @@ def _choose(package: Package, variant: str | None) -> PackagedFile:
     if not known:
         nested = [name for name in (package.archive.files if package.archive else ()) if name.endswith(".ssd")]
         hint = f" There is {nested[0]}: pack the files in that folder, not the folder." if nested else ""
+        if package.archive is not None and "modelDescription.xml" in package.archive.files:
+            hint = f" It is an FMU: write Fmu({file!r})."
         raise SspFileError(
             f"{file!r} has no description; expected {DEFAULT} at its root.{hint or ' Export it again.'}",
             fault=FmuFault.NO_DESCRIPTION,

@@ -101,7 +101,8 @@ class FmuArchive:
         if DESCRIPTION not in self.files:
             nested = next((name for name in self.files if name.endswith(f"/{DESCRIPTION}")), None)
             other = next((name for name in self.files if name.casefold() == DESCRIPTION.casefold()), None)
-            hint = " Give the .fmu that the tool exported."
+            is_ssp = "SystemStructure.ssd" in self.files
+            hint = " It is an SSP: Diagram.from_ssp reads it." if is_ssp else " Give the .fmu that the tool exported."
             hint = f" There is {nested}: pack the files in that folder, not the folder." if nested else hint
             hint = f" There is {other}: its name must be {DESCRIPTION}." if other else hint
             raise FmuFileError(

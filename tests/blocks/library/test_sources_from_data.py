@@ -76,6 +76,22 @@ def test_a_run_that_was_written_plays_again(tmp_path):
     assert Recorded.from_pandas(run.to_pandas("arc")["arc"]).values.tolist() == run["arc"].tolist()
 
 
+def test_files_that_are_almost_right_say_what_to_change(tmp_path):
+    file = tmp_path / "data.csv"
+    file.write_text("0.0,1.0\n0.5,2e-3\n")
+    with pytest.raises(
+        ParameterError, match=r"numbers 0\.0, 1\.0 in the first line .* Put a line above them, such as t,y"
+    ):
+        Recorded.from_csv(file)
+    file.write_text("t;y\n0,0;1,5\n")
+    with pytest.raises(
+        ParameterError, match=r"the row 2 of .* Write decimal points, or .* decimal=','\) and from_pandas"
+    ):
+        Recorded.from_csv(file, name="data")
+    with pytest.raises(OptionError, match=r"is a folder; .* run = Run\.open\(path\), Recorded\(times=run\.t"):
+        Recorded.from_csv(tmp_path)
+
+
 def test_other_separators_and_rows_at_one_time(tmp_path):
     file = tmp_path / "measured.csv"
     file.write_text("time; speed\n0.0; 1.0\n0.5; 2.0\n0.5; 3.0\n1.0; 4.0\n", encoding="utf-8-sig")

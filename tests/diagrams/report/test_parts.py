@@ -69,6 +69,8 @@ def test_parts_that_apply_make_sections_and_those_of_one_key_make_one():
     assert case.keys == ("b",)
     with pytest.raises(OptionError, match="no section 'e'; expected some of a, b, c, d"):
         kind.check_keys(["e"])
+    with pytest.raises(OptionError, match=r"found 'b'; expected a list of sections\. Write only=\['b'\]"):
+        kind.check_keys("b")
 
 
 def test_a_diagram_brings_a_report_of_its_own():

@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import zipfile
 from html import unescape
 from types import SimpleNamespace
 
@@ -29,10 +30,10 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.blocks.core import near, parse_unit
-from loopwright.diagrams import DefinitionError
+from loopwright.diagrams import DefinitionError, SspFileError
 from loopwright.diagrams.exporting import make_exported
 from loopwright.diagrams.sweeps.samples import grid, table
-from loopwright.fmus import Fmu, FmuError, dc_motor
+from loopwright.fmus import Fmu, FmuError, FmuFileError, dc_motor
 from loopwright.fmus.fmu_block.fmu_start_values import check_value
 from loopwright.sweeps import Box
 
@@ -240,6 +241,18 @@ def test_a_state_that_an_fmu_computes_at_the_start_is_called_a_state():
         check_value(description, "s", 1.0, "fmu")
     with pytest.raises(ParameterError, match=r"^fmu\.start\.v: found a variable that is computed"):
         check_value(description, "v", 1.0, "fmu")
+
+
+def test_an_fmu_and_an_ssp_lead_to_what_reads_them(tmp_path):
+    for name, within in (("plant.fmu", "modelDescription.xml"), ("system.ssp", "SystemStructure.ssd")):
+        with zipfile.ZipFile(tmp_path / name, "w") as archive:
+            archive.writestr(within, "<a/>")
+    with pytest.raises(
+        SspFileError, match=r"plant\.fmu' has no description; .* It is an FMU: write Fmu\('.*plant\.fmu'\)"
+    ):
+        Diagram.from_ssp(tmp_path / "plant.fmu")
+    with pytest.raises(FmuFileError, match=r"so it is no FMU\. It is an SSP: Diagram\.from_ssp reads it"):
+        Fmu(tmp_path / "system.ssp")
 
 
 def test_the_range_of_a_start_value_that_is_above_0_says_so():
