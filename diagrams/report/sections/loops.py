@@ -198,10 +198,11 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     if not loops:
         return None
     periodic = [of for of in loops if of.periodic is not None]
+    has_rate = any(of.margins is not None for of in periodic)
     text = [
         *(_other_cuts(case, case.loop_places[key]) if key in case.loop_places else ()),
         *notes,
-        *(TEXTS.paragraphs("periodic", wire=wire) if periodic else ()),
+        *(TEXTS.paragraphs("periodic", wire=wire, has_rate=has_rate) if periodic else ()),
     ]
     numbers = {path: number for of in loops for path, number in of.numbers.items()}
     section = Section(key, f"Loop at {wire}", tuple(text), tuple(_tables(wire, loops)), (), numbers, absent=absent)
