@@ -151,7 +151,7 @@ def attach_environment(
         assert tick is not None
         put_at, forces = _put_held(table, ports, model, values, inputs, tick)
     else:
-        put_at, forces = _put_in_solver(table, ports, model, values, inputs, tick)
+        put_at, forces = _put_in_solver(table, ports, model, values, inputs, tick, is_felt=measured is not None)
     table.wires[path, ports.force] = Wire(put_at, "total")
     if measured is not None:
         forces[0] = hold_separately(table, measured.port[0], forces[0], f"{name}_felt")
@@ -186,6 +186,8 @@ def _put_in_solver(
     values: Mapping[str, Any],
     inputs: Mapping[str, Wire],
     tick: Fraction | None,
+    *,
+    is_felt: bool,
 ) -> tuple[str, list[Wire]]:
     """Put the environment next to a plant with equations; return its path, and the forces that are felt."""
     path, name = ports.plant, values["name"]
@@ -206,7 +208,7 @@ def _put_in_solver(
             _reroute(table, before)
     force = _add(table, Environment(**values), "force", "", {**inputs, "acceleration": acceleration})
     forces = [force]
-    if values["mass"]:
+    if values["mass"] and is_felt:
         inertia = Wire(force.block, "inertia")
         forces.append(inertia if tick is None else _sample(table, sampling, inertia, "inertia_before"))
     return force.block, forces

@@ -2,6 +2,7 @@
 
 import re
 import zipfile
+from fractions import Fraction
 from functools import cache
 
 import numpy as np
@@ -11,9 +12,13 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Block, Constant, Gain, Input, OptionError, Output, State
 from loopwright.diagrams import ConfirmationError, Diagram, subsystem
+from loopwright.diagrams.contact.attached_environment import attach_environment
 from loopwright.diagrams.contact.confirmed_limits import LimitTrials
+from loopwright.diagrams.contact.moored_plant import Mooring
+from loopwright.diagrams.linearization import linearize_plant
 from loopwright.fmus import Fmu, build
 from loopwright.types import TrialMethod
+from support.haptic import HANDLE, haptic
 
 M, SHARE, DRAG, T, SUBSTEPS = 0.5, 8.0, 40.0, 5e-3, 10
 """Mass in kg, share of the measured force that the drive adds, drag in N s/m, sample time in s."""
@@ -173,3 +178,12 @@ def test_a_run_that_an_fmus_solver_damps_refutes_its_limit_and_says_what_to_try(
     monkeypatch.setattr(LimitTrials, "run", damped)
     with pytest.raises(ConfirmationError, match=r"cart: stiffness .* is refuted.*StepOptions\(tolerance=1e-10\)"):
         here.confirm(limit)
+
+
+def test_a_mass_that_no_sensor_feels_is_sampled_nowhere():
+    here = haptic(300.0).contact("handle.push", direction=[1.0], **HANDLE)
+    model = linearize_plant(here.wired, here.point, here.plant)
+    mooring = Mooring(np.array([1.0]), np.zeros(()), stiffness=100.0, mass=0.1, kick=1.0, kick_time=1e-3)
+    made = attach_environment(here.wired, here.ports, model, None, mooring, None, Fraction(1, 1000))
+    assert "environment" in made.blocks
+    assert [path for path in made.blocks if path.startswith("environment_sampling")] == []
