@@ -1,7 +1,7 @@
 """Functions of an FMU's library for one instance, for all versions of FMI.
 
-What differs between versions in names and in the shapes of arguments is in a table, `FmiVersion`; what an instance
-has to be told otherwise, in the class of a version.
+Differences between versions in names and in the shapes of arguments are in a table, `FmiVersion`; other steps of an
+instance's life, in the class of a version.
 """
 
 from __future__ import annotations

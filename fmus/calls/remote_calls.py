@@ -116,7 +116,9 @@ class RemoteCalls(FmiCalls):
         self.process.take_message, self.process.lose = log, self.lose
         super().instantiate(log)  # type: ignore[safe-super]
         if self.process.find(self.fmu.component) is not None:  # an address there that is shared memory here
-            raise FmuError("its instance has an address that can't be told from shared memory; run it again.")
+            raise FmuError(
+                "its instance has an address that is also one of shared memory; expected another. Run it again."
+            )
 
     def renew(self, log: Log, running: bool) -> None:
         """Free the instance and make another one, to which C in the child is bound, too; see `FmiCalls.renew`."""

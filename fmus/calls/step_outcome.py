@@ -91,10 +91,10 @@ class StepOutcome:
             return ""
         if given is None:
             return (
-                f"Its default experiment ends at {stop:g} s, beyond which some FMUs take no step. Tell it a later end: "
+                f"Its default experiment ends at {stop:g} s, beyond which some FMUs take no step. Give a later one: "
                 "stepping=StepOptions(stop_time=…)."
             )
-        return f"It was told the end {stop:g} s, by stepping=StepOptions(stop_time=…). Give a later one."
+        return f"Its end is {stop:g} s, by stepping=StepOptions(stop_time=…). Give a later one."
 
     def take_end(self, t: float, h: float, reached: float) -> None:
         """Note that the FMU asks to end the simulation, at a time in s within a step from t over h.
@@ -137,7 +137,7 @@ class StepOutcome:
         if early:
             raise FmuRuntimeError(
                 f"the step from t = {t:.9g} s by {h:g} s returned early, at {call.reached.value:.9g} s (earlyReturn), "
-                f"though the FMU was told that it must not (earlyReturnAllowed = false){fmu.quote_messages()} Take "
+                f"though it must not (earlyReturnAllowed = false){fmu.quote_messages()} Take "
                 "steps that end where its events are, or export it without early return.",
                 block=fmu.setup.label,
                 t=t,

@@ -572,7 +572,7 @@ def test_an_fmu_that_ends_with_its_experiment_is_told_a_later_end(cache, tmp_pat
     told = Diagram("d", plant())
     run = told.simulate(0.1, step=0.01, progress=False)
     assert run["plant.y"] == pytest.approx(run.t)
-    with pytest.raises(FmuRuntimeError, match=r"It was told the end 0\.1 s, by stepping=StepOptions\(stop_time"):
+    with pytest.raises(FmuRuntimeError, match=r"Its end is 0\.1 s, by stepping=StepOptions\(stop_time"):
         told.simulate(0.2, step=0.01, progress=False)
 
 
