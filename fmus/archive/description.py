@@ -340,7 +340,11 @@ def find_description(
     if status is None or not stat.S_ISREG(status.st_mode):
         shown = str(Path(os.path.expanduser(os.fspath(file))))
         found = f"{shown!r} is a folder" if os.path.isdir(path) else f"there is no file {shown!r}"
-        folder = "" if _is_absolute(os.fspath(file)) else f" It is relative to the working folder, {os.path.dirname(path)!r}."
+        folder = (
+            ""
+            if _is_absolute(os.fspath(file))
+            else f" It is relative to the working folder, {os.path.dirname(path)!r}."
+        )
         raise FmuFileError(f"{found}; expected an FMU. Check the path.{folder}", fault=FmuFault.NO_FILE)
     identity = (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size)
     return _read(path, identity, limits or _USUAL, _key_of(sizes) if sizes else ())
