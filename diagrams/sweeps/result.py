@@ -84,7 +84,7 @@ class Sweep(ShownAsTable):
                 Grid("", ("", *self.samples.names, *self._reductions), tuple(self._rows()), total=len(rows)),
                 Grid("Failures", ("sample", "error", "message"), tuple((f.index, f.kind, f.message) for f in failures)),
             ),
-            self.messages,
+            (*self.messages, *self._mixed_units()),
         )
 
     def _rows(self) -> Iterator[tuple[Any, ...]]:
@@ -215,8 +215,23 @@ class Sweep(ShownAsTable):
 
     @cached_property
     def units(self) -> Mapping[str, str]:
-        """Units of signals and reductions, as far as they are declared."""
-        return {name: unit for o in self.outcomes if o is not None for name, unit in o.units.items()}
+        """Units of signals and reductions, as far as they are declared, and the same in all runs."""
+        return {name: units[0] for name, units in self._units.items() if len(units) == 1}
+
+    @cached_property
+    def _units(self) -> Mapping[str, Sequence[str]]:
+        """Return the units that each signal and reduction has: several where plants that count otherwise are swept."""
+        found = {(name, unit): None for o in self.outcomes if o is not None for name, unit in o.units.items()}
+        return {name: [unit for of, unit in found if of == name] for name, _ in found}
+
+    def _mixed_units(self) -> Iterator[str]:
+        """Yield a line for each signal and reduction whose numbers can't be compared as they are."""
+        for name, units in self._units.items():
+            if len(units) > 1:
+                yield (
+                    f"{name}: found {enumerate_some(units, 8)}; its numbers are in the unit of their run, and can't be "
+                    "compared as they are. Convert them, or put a UnitConversion in front of the wire."
+                )
 
     @cached_property
     def dataset(self) -> Dataset:

@@ -571,3 +571,19 @@ def test_texts_are_coordinates_as_they_are():
     compared = Diagram("c", Compare(relation=">", name="cmp")(Constant(value=1.0), Constant(value=2.0)).named("y"))
     found = compared.sweep({"cmp.relation": [">", "<"]}, 0.1, reduce={"end": final("y")}, progress=False)
     assert [float(found.dataset["end"].sel({"cmp.relation": relation})) for relation in (">", "<")] == [0.0, 1.0]
+
+
+def test_numbers_of_runs_in_several_units_have_no_unit_and_are_named():
+    """A sweep over plants, of which one counts in rpm: each run has the numbers of a single one."""
+    slopes = [Ramp(slope=1.0, unit=unit, name="ramp") for unit in ("rad/s", "rpm")]
+    diagram = Diagram("d", slopes[0].named("speed"))
+    found = diagram.sweep(
+        {"ramp": slopes}, 1.0, step=0.5, signals="speed", reduce={"end": final("speed")}, **INTERPRETED
+    )
+    np.testing.assert_array_equal(found["end"], [1.0, 1.0])
+    assert found.units == {}
+    assert "speed: found rad/s, rpm; its numbers are in the unit of their run" in str(found)
+    assert "units" not in found.dataset["speed"].attrs
+    alike = diagram.sweep({"ramp": slopes[:1]}, 1.0, step=0.5, signals="speed", **INTERPRETED)
+    assert alike.units == {"speed": "rad/s"}
+    assert "its numbers" not in str(alike)
