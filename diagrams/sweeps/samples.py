@@ -177,13 +177,15 @@ class Samples(Sequence[Sample]):
         return (len(self),) if self.axes is None else tuple(len(values) for values in self.axes.values())
 
     def column(self, name: str) -> np.ndarray:
-        """Return the values of a parameter, one row for each sample; blocks, and arrays of several shapes, as objects.
+        """Return the values of a parameter, one row for each sample.
+
+        Blocks, arrays of several shapes, and numbers among texts are objects.
 
         Raises `ValueError` for a name that is not among the names.
         """
         values = [row[self.names.index(name)] for row in self.rows]
         plain = all(isinstance(value, bool | int | float | str | tuple | list | np.ndarray) for value in values)
-        if plain and len({np.shape(value) for value in values}) == 1:
+        if plain and len({(np.shape(value), isinstance(value, str)) for value in values}) == 1:
             return np.array(values)
         found = np.empty(len(values), dtype=object)
         found[:] = values

@@ -26,7 +26,7 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, maximum, mean, minimum, settling_time
 from loopwright.diagrams.sweeps.plan import make_plan
-from loopwright.diagrams.sweeps.samples import Samples
+from loopwright.diagrams.sweeps.samples import Samples, grid
 from loopwright.diagrams.sweeps.worker import Worker
 from loopwright.diagrams.sweeps.workers import make_worker
 from support.waiting import FAR
@@ -225,6 +225,10 @@ def test_parameters_are_read_as_results_are_one_row_for_each_sample():
     np.testing.assert_array_equal(found["source.values"], [[1.0, -0.5], [2.0, 0.5]])
 
 
+def test_a_number_among_texts_stays_a_number():
+    assert grid({"limit": ("none", 1.5)}).column("limit").tolist() == ["none", 1.5]
+
+
 def test_a_block_that_is_replaced_and_its_parameters_go_together():
     diagram = many_rates()
     table = [
@@ -337,23 +341,23 @@ def _counted(name, calls):
 
 def test_the_data_set_of_a_grid_has_the_parameters_as_dimensions():
     diagram = sampled_lag()
-    grid = diagram.sweep(
+    found = diagram.sweep(
         {"step.times": (0.0, 0.02), "step.values": (1.0, 2.0, 3.0)},
         0.05,
         signals="y",
         reduce={"end": final("y"), "two": lambda run: run["y"][:2]},
         **INTERPRETED,
     )
-    data = grid.dataset
-    first, second = grid.samples.names
+    data = found.dataset
+    first, second = found.samples.names
     assert data["y"].dims == (first, second, "t")
     assert data["y"].shape == (2, 3, 6)
     assert data["two"].dims == (first, second, "two_dim")
     assert data["t"].attrs["units"] == "s"
-    for i, sample in enumerate(grid.samples):
+    for i, sample in enumerate(found.samples):
         here = data.sel(dict(sample.parameters.items()))
-        np.testing.assert_array_equal(here["y"], grid["y"][i])
-        assert here["end"].item() == grid["end"][i]
+        np.testing.assert_array_equal(here["y"], found["y"][i])
+        assert here["end"].item() == found["end"][i]
     spread = diagram.sweep({"step.values": (1.0, 2.0)}, 0.05, samples="latin", count=4, signals="y", **INTERPRETED)
     assert spread.dataset["y"].dims == ("sample", "t")
     np.testing.assert_array_equal(spread.dataset["step.values"], [s.parameters["step.values"] for s in spread.samples])
