@@ -91,7 +91,8 @@ def trace_error(error: Exception, block: Block, equation: str) -> TraceError:
     if isinstance(error, AttributeError) and (known := getattr(error.obj, "_fields", ())):
         text += f" {near(str(error.name), known)}"
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
-        mistake = TraceError(f"{text} Correct the equation there.")
+        step = _own_name(error.name, block) if isinstance(error, NameError) else ""
+        mistake = TraceError(f"{text} {step or 'Correct the equation there.'}")
         mistake.is_mistake = True
         return mistake
     return TraceError(
@@ -100,10 +101,19 @@ def trace_error(error: Exception, block: Block, equation: str) -> TraceError:
     )
 
 
+def _own_name(name: str | None, block: Block) -> str:
+    """Return how an equation reads what it has called by its bare name, as far as the block has it."""
+    owners = {"self": block.parameters, "x": block.states, "u": block.inputs}
+    owner = next((owner for owner, known in owners.items() if name in known), None)
+    return f"Write {owner}.{name}." if owner else ""
+
+
 def _describe(value: Any) -> str:
     """Name in words the value that an equation returned."""
     if value is None:
         return "nothing"
+    if fields := getattr(value, "_fields", ()):
+        return f"all of {type(value).__name__} ({', '.join(fields)})"
     shape = _shape(value)
     if isinstance(value, ArrayInterface | np.ndarray | float | int | np.number):
         return f"an array of shape {shape}" if shape else "a single value"
@@ -160,7 +170,9 @@ def _column(part: Any, expected: Shape | None, name: str, equation: str) -> tupl
         wanted = (
             "a number or an array" if expected is None else f"a value of shape {expected}" if expected else "one value"
         )
-        if isinstance(part, Mapping):
+        if fields := getattr(part, "_fields", ()):
+            step = f"Return one of them, such as {type(part).__name__}.{fields[0]}."
+        elif isinstance(part, Mapping):
             step = "Return the value itself."
         elif n > 1 or (n and expected):
             step = "Build a vector with np.stack: return np.stack([…])."

@@ -182,9 +182,10 @@ def _refuse_words(variable: FmuVariable, value: Any, label: str) -> ParameterErr
         return ParameterError(f"{text} {near(str(value), variable.items)}", block=label, port=port)
     if variable.type == "Boolean":
         expected = "True or False" if not variable.shape else f"True or False in the shape {variable.shape}"
-    return ParameterError(
-        f"found {value!r}; expected {expected}, no text. Leave out the quotes.", block=label, port=port
-    )
+    step = "Leave out the quotes."
+    if isinstance(value, str) and variable.unit and not value.strip().replace(".", "", 1).lstrip("+-").isdigit():
+        step = f"Give it in {variable.unit}, without the unit."
+    return ParameterError(f"found {value!r}; expected {expected}, no text. {step}", block=label, port=port)
 
 
 def _too_large(numbers: Any) -> bool:

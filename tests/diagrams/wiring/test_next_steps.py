@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from loopwright import Block, Diagram, Input, State, build, doctor, subsystem
+from loopwright import Block, Diagram, Input, Output, State, build, doctor, subsystem
 from loopwright.blocks import (
     PID,
     Encoder,
@@ -21,6 +21,7 @@ from loopwright.blocks import (
     SmoothStep,
     Stack,
     Step,
+    TraceError,
     TransferFunction,
     TransportDelay,
     UnitConversion,
@@ -243,6 +244,35 @@ def test_a_state_that_an_fmu_computes_at_the_start_is_called_a_state():
         check_value(description, "v", 1.0, "fmu")
 
 
+class Bare(Block):
+    """A block whose output is whatever a function of (self, x, u) returns."""
+
+    returned: object
+    gain: float = 2.0
+    u, y = Input(), Output()
+    level = State(shape=(2,))
+
+    def derivative(self, t, x, u):
+        return -x.level
+
+    def output(self, t, x, u):
+        return self.returned(self, x, u)
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        (lambda self, x, u: gain * u.u, r"NameError: name 'gain' is not defined\. Write self\.gain\."),  # noqa: F821
+        (lambda self, x, u: level[0], r"name 'level' is not defined\. Write x\.level\."),  # noqa: F821
+        (lambda self, x, u: foo, r"name 'foo' is not defined\. Correct the equation there\."),  # noqa: F821
+        (lambda self, x, u: x, r"returned all of x \(level\) for y; .* Return one of them, such as x\.level\."),
+    ],
+)
+def test_a_bare_name_in_an_equation_says_where_it_is(returned, said):
+    with pytest.raises(TraceError, match=said):
+        Diagram("d", Bare(returned=returned)(1.0))
+
+
 def test_an_fmu_and_an_ssp_lead_to_what_reads_them(tmp_path):
     for name, within in (("plant.fmu", "modelDescription.xml"), ("system.ssp", "SystemStructure.ssd")):
         with zipfile.ZipFile(tmp_path / name, "w") as archive:
@@ -258,6 +288,9 @@ def test_an_fmu_and_an_ssp_lead_to_what_reads_them(tmp_path):
 def test_the_range_of_a_start_value_that_is_above_0_says_so():
     with pytest.raises(ParameterError, match=r"found -1\.0; the FMU allows numbers above 0 in Ohm\. Give a value in"):
         Fmu(dc_motor.build(), start={"resistance": -1.0})
+    for text, step in (("100 Ohm", "Give it in Ohm, without the unit"), ("1.5", "Leave out the quotes")):
+        with pytest.raises(ParameterError, match=rf"found '{text}'; expected a number, no text\. {step}"):
+            Fmu(dc_motor.build(), start={"resistance": text})
 
 
 def test_an_examination_of_an_fmu_is_a_table_in_a_notebook():
