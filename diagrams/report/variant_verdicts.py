@@ -26,7 +26,7 @@ from ..wiring import join
 from .case import Case
 from .sections.injection import is_refuted
 from .sections.step_responses import unit_at
-from .sections.step_runs import APART, key_of_step
+from .sections.step_runs import APART, required_steps
 from .stability import Stability, why_unstable
 from .variant import Cut, Variant
 
@@ -115,8 +115,8 @@ class VariantReview:
                     yield result
         if v.is_actual:
             yield from self._nowhere(seen, bool(loops))
-        for step in asked.steps:
-            yield from self._step(key_of_step(step), step, loop="")
+        for key, step in required_steps(self.case, asked, v).items():
+            yield from self._step(key, step, loop="")
 
     # --- stability ----------------------------------------------------------------------------------------------------
 

@@ -26,7 +26,7 @@ from ...measure import (
     remaining_oscillation,
     step_response,
 )
-from ...requirements import StepLimits, StepSize
+from ...requirements import Requirements, StepLimits, StepSize
 from ...results import OperatingPoint
 from ..case import Case
 from ..variant import Variant, in_s
@@ -87,14 +87,28 @@ def step_tests(case: Case, v: Variant) -> Iterator[StepTest]:
     names = case.names_of_loops()
     for key, wire in case.loop_wires().items():
         yield StepTest(key, wire, "", None if asked is None else asked.step_of(names[key], v.key))
-    for limits in () if asked is None else asked.steps:
-        yield StepTest(key_of_step(limits), limits.input, limits.output, limits)
+    for key, limits in required_steps(case, asked, v).items():
+        yield StepTest(key, limits.input, limits.output, limits)
 
 
-def key_of_step(limits: StepLimits) -> str:
-    """Return the key of a required step that names its wires."""
-    ends = [limits.input, limits.output] if limits.output else [limits.input]
-    return "_to_".join(end.replace(".", "_") for end in ends)
+def required_steps(case: Case, asked: Requirements | None, v: Variant) -> dict[str, StepLimits]:
+    """Return the steps between wires that are required, by their keys, which name the wires.
+
+    Further ones at the same wires are numbered, as one at a loop's own wire that has limits of its own: each is a run.
+    """
+    if asked is None:
+        return {}
+    of_loops = {key for key, names in case.names_of_loops().items() if asked.step_of(names, v.key) is not None}
+    found: dict[str, StepLimits] = {}
+    for limits in asked.steps:
+        ends = [limits.input, limits.output] if limits.output else [limits.input]
+        first = "_to_".join(end.replace(".", "_") for end in ends)
+        key, number = first, 1
+        while key in found or key in of_loops:
+            number += 1
+            key = f"{first}_{number}"
+        found[key] = limits
+    return found
 
 
 @dataclass(frozen=True)

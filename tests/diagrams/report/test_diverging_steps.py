@@ -69,3 +69,18 @@ def test_a_response_that_a_limit_only_slows_down_is_not_called_diverging():
     assert "steps.wish_to_y.continuous.diverges" not in report.numbers()
     (result,) = [result for result in report.review.results if result.is_step]
     assert result.reason is not Reason.DIVERGES
+
+
+@pytest.mark.slow
+def test_steps_of_several_sizes_at_the_same_wires_have_a_run_and_a_verdict_each():
+    """The small step's numbers stood for the large one, too, which diverges: it passed."""
+    ends = {"input": "wish", "output": "y"}
+    asked = Requirements(step=[{**ends, "size": 2.0, "overshoot": 0.5}, {**ends, "size": 0.1, "overshoot": 0.5}])
+    report = analyse(unstable_plant(), requirements=asked, only=("poles", "steps"))
+    found = [(r.size.value, r.verdict, r.path) for r in report.review.results if r.is_step]
+    start, end = "steps.wish_to_y", "continuous.overshoot"
+    assert sorted(found) == [(0.1, Verdict.PASSED, f"{start}_2.{end}"), (2.0, Verdict.FAILED, f"{start}.{end}")]
+    at_loop = Requirements(step=[{"size": 0.1, "peak": 0.3}, {"input": "u", "size": 1.0, "peak": 0.3}])
+    report = analyse(unstable_plant(), loops=["u"], requirements=at_loop, only=("poles", "steps"))
+    found = {r.size.value: r.verdict for r in report.review.results if r.is_step}
+    assert found == {0.1: Verdict.PASSED, 1.0: Verdict.FAILED}
