@@ -99,6 +99,10 @@ def read_matrices(system: LinearSystem) -> Matrices:
                 f"found a {type(system).__name__}; expected the loop at a wire. Give {made_of}.loop('wire'), with "
                 "a wire's name."
             ) from error
+        if isinstance(system, str):
+            raise ParameterError(
+                f"found {system!r}; expected the loop at a wire. Give diagram.linearize().loop({system!r})."
+            ) from error
         raise ParameterError(
             f"found {type(system).__name__}, which python-control can't turn into a state space ({error}); expected "
             "a control.StateSpace. Make one with control.ss(A, B, C, D, dt)."

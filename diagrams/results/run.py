@@ -366,6 +366,8 @@ class Run(ShownAsTable, metaclass=_RunClass):
             If t is not within the run, or the states were not recorded.
         """
         if not (len(self.t) and kinds.is_real(t) and self.t[0] <= t <= self.t[-1] * (1 + 1e-12) + 1e-12):
+            if not kinds.is_real(t):
+                raise OptionError(f"found t = {t!r}; expected one time in s. Give one, such as run.at(0.5).")
             span = f"{self.t[0]:g} s to {self.t[-1]:g} s" if len(self.t) else "nothing"
             raise OptionError(f"found t = {t!r}; the run holds {span}. Choose a time within.")
         k = int(np.searchsorted(self.t, t * (1 + 1e-12) + 1e-12, side="right")) - 1

@@ -116,13 +116,14 @@ def check_reductions(reduce: Any, diagram: str) -> dict[str, Callable[[Run], Any
     """Return reductions by name."""
     if not isinstance(reduce, Mapping) or not all(isinstance(name, str) for name in reduce):
         raise OptionError(
-            f"found reduce={reduce!r}; expected reductions by name, such as {{'end': final('y')}}.", block=diagram
+            f"found reduce={reduce!r}; expected reductions by name. Give reduce={{'end': final('y')}}.", block=diagram
         )
     for name, function in reduce.items():
         if not callable(function):
+            signal = function if isinstance(function, str) else "y"
             raise OptionError(
                 f"found {function!r} for {name!r}; expected final(signal), maximum(signal) or another reduction, or a "
-                "function that takes a run and returns numbers.",
+                f"function that takes a run and returns numbers. Give reduce={{{name!r}: final({signal!r})}}.",
                 block=diagram,
                 port="reduce",
             )

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from loopwright import Block, Diagram, Input, Output, State, build, doctor, subsystem
+from loopwright import Block, Diagram, Input, Output, State, build, doctor, margins, subsystem
 from loopwright.blocks import (
     PID,
     Encoder,
@@ -147,6 +147,32 @@ def test_a_linear_model_says_where_plots_and_margins_are(loop):
 @pytest.mark.parametrize("ask", [lambda m: m.linearize(inputs="ref"), lambda m: m.linearize().loop("ref")])
 def test_the_beginning_of_a_name_leads_to_it(loop, ask):
     with pytest.raises(UnknownNameError, match="Did you mean 'reference.y'"):
+        ask(loop)
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (
+            lambda loop: margins("u"),
+            r"found 'u'; expected the loop at a wire\. Give diagram\.linearize\(\)\.loop\('u'\)",
+        ),
+        (
+            lambda loop: loop.simulate(0.1, progress=False).at([0.05]),
+            r"found t = \[0\.05\]; expected one time in s\. Give",
+        ),
+        (
+            lambda loop: loop.sweep({"controller.pid.kp": (1.0, 2.0)}, 0.1, reduce={"p": "speed"}),
+            r"found 'speed' for 'p'; .* Give reduce=\{'p': final\('speed'\)\}",
+        ),
+        (
+            lambda loop: loop.sweep({"controller.pid.kp": (1.0, 2.0)}, 0.1, reduce="p"),
+            r"Give reduce=\{'end': final\('y'\)\}",
+        ),
+    ],
+)
+def test_a_name_in_place_of_what_it_names_says_what_to_give(loop, ask, said):
+    with pytest.raises(LoopwrightError, match=said):
         ask(loop)
 
 
