@@ -2,6 +2,7 @@
 
 import csv
 import re
+import time
 from functools import cache
 
 import numpy as np
@@ -159,6 +160,13 @@ def test_it_fits_the_screen_in_both_schemes(file, size, scheme):
         assert ground == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 25, 31)"}[scheme]
 
 
+def seconds_in(page, text):
+    """Return the seconds that the page's note names; a busy machine makes them more than were waited for."""
+    note = page.inner_text("#note")
+    assert note.startswith(text)
+    return float(re.search(r"for ([\d.]+) s", note)[1])
+
+
 def test_a_delay_is_given_up_and_the_page_says_so(file):
     """The browser is held up for 0.7 s; then the page is out of sight as long: the run is late by that, and no jump."""
     away = """async hidden => {
@@ -166,6 +174,7 @@ def test_a_delay_is_given_up_and_the_page_says_so(file):
         document.dispatchEvent(new Event('visibilitychange'));
     }"""
     with opened(file) as page:
+        began = time.monotonic()
         page.evaluate("page.play()")
         page.wait_for_timeout(300)
         held = page.evaluate(
@@ -178,7 +187,8 @@ def test_a_delay_is_given_up_and_the_page_says_so(file):
         )
         assert held[0] < 300
         assert held[1] > 0.6
-        assert page.inner_text("#note").startswith("The browser held the page up for 0.")
+        assert 0.6 < seconds_in(page, "The browser held the page up for") < 1.05 * (time.monotonic() - began)
+        hidden = time.monotonic()
         page.evaluate(away, True)
         page.wait_for_timeout(100)
         before = page.evaluate("page.ticks")
@@ -187,7 +197,7 @@ def test_a_delay_is_given_up_and_the_page_says_so(file):
         page.evaluate(away, False)
         page.wait_for_timeout(100)
         assert before < page.evaluate("page.ticks") < before + 500
-        assert page.inner_text("#note").startswith("The page was out of sight for 0.")
+        assert 0.65 < seconds_in(page, "The page was out of sight for") < 1.05 * (time.monotonic() - hidden)
         page.click("#reset")
         assert page.is_hidden("#note")
 
