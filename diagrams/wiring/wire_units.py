@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from typing import Any
@@ -24,8 +25,9 @@ from .structure import Structure, Wire, join
 Unit = PortUnit
 Port = tuple[str, str]
 _MOST_ROUNDS = 100
-_MOST_CHANGES = 8
-"""Changes of an output's unit while those of a loop of sums follow from each other."""
+_MOST_CHANGES = 1000
+"""Changes of an output's unit while those of a loop of sums follow from each other; without a loop they end by
+themselves."""
 
 
 def follow_units(
@@ -50,7 +52,7 @@ def follow_units(
         for name in table.blocks[path].inputs:
             if (wire := table.wires.get((path, name))) is not None:
                 rules.setdefault((wire.block, wire.port), []).append(path)
-    waiting, changes = list(units), dict.fromkeys(units, _MOST_CHANGES)  # a declared unit stays
+    waiting, changes = deque(units), dict.fromkeys(units, _MOST_CHANGES)  # a declared unit stays
 
     def put(output: Port, unit: Unit) -> None:
         """Note a unit, which may differ from that before: a difference is known only with both of its ends."""
@@ -63,7 +65,7 @@ def follow_units(
             waiting.append(output)
 
     while waiting:
-        source = waiting.pop()
+        source = waiting.popleft()
         for path in rules.get(source, ()):
             with suppress(UnitError):  # check_units raises it
                 inputs = _input_units(table, units, converted, path, shapes)

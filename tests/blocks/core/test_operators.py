@@ -129,6 +129,15 @@ def of(unit):
     return Constant(value=0.5, unit=unit) if isinstance(unit, str) else Pair(units=unit)(0.5)
 
 
+def alternating_sum(n):
+    """T - T + T …, where each second one comes later: until then a sum may be a temperature or a difference."""
+    total = of("degC")
+    for _ in range(n):
+        late = Saturation(limit=100.0)(Saturation(limit=100.0)(total))
+        total = total - late + late
+    return total
+
+
 @pytest.mark.parametrize(
     ("make", "unit"),
     [
@@ -171,6 +180,7 @@ def of(unit):
         (lambda: (of("degC") - of("degC")) * of("W/K"), "W"),
         (lambda: of("degC") + Saturation(limit=1.0)(of("degC") - of("degC")), "degC"),
         (lambda: of(("degC", "m")) - of(("degC", "m")), ("K", "m")),
+        (lambda: alternating_sum(20), "degC"),
         (lambda: np.mean(of(("degC", "degC"))), "degC"),
         (lambda: np.sum(of(("degC", "degC"))), None),
         (lambda: np.ptp(of(("degC", "degC"))), "K"),
