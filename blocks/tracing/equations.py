@@ -91,8 +91,8 @@ def trace_error(error: Exception, block: Block, equation: str) -> TraceError:
     if isinstance(error, AttributeError) and (known := getattr(error.obj, "_fields", ())):
         text += f" {near(str(error.name), known)}"
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
-        step = _own_name(error.name, block) if isinstance(error, NameError) else ""
-        mistake = TraceError(f"{text} {step or 'Correct the equation there.'}")
+        advice = _own_name(error.name, block) if isinstance(error, NameError) else ""
+        mistake = TraceError(f"{text} {advice or 'Correct the equation there.'}")
         mistake.is_mistake = True
         return mistake
     return TraceError(
