@@ -167,7 +167,7 @@ def _refuse_vacuous(name: str, end: float, port: str) -> None:
     if name == "overshoot" and end > 1.0:
         raise OptionError(
             f"found {end:g}, which is {100.0 * end:g} % of the final change; expected a share of it, up to 1. Give "
-            f"{name} = {end / 100.0:g} for {end:g} %.",
+            f"{name} = {end / 100.0:g} for {end:g} %, or the range (0, {end:g}) for {100.0 * end:g} %.",
             port=port,
         )
     side = {"gain_margin_high": "above", "gain_margin_low": "below"}.get(name)

@@ -124,7 +124,7 @@ def test_the_step_of_a_loop_replaces_the_general_one_and_steps_between_wires_sta
         ({"gain_margin": 2.0}, "write gain_margin_high=2.0, which is 6 dB, and gain_margin_low=0.5"),
         ({"overshoot": 0.1}, "It is one of a step response: step={'overshoot': 0.1}"),
         ({"step": {"overshoot": 10}}, "step.overshoot: found 10, which is 1000 % of the final change"),
-        ({"step": {"overshoot": 10}}, "Give overshoot = 0.1 for 10 %."),
+        ({"step": {"overshoot": 10}}, "Give overshoot = 0.1 for 10 %, or the range (0, 10) for 1000 %."),
         (
             {"gain_margin_high": 0.5},
             "gain_margin_high: found 0.5, which every stable loop meets; expected a factor above 1",
