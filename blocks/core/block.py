@@ -444,7 +444,9 @@ def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[s
         if name not in inputs:
             raise UnknownNameError(f"it has no input {name!r}. {near(name, inputs)}", block=who)
         if name in given:
-            raise DoubleDriveError("it is driven twice in one call, by position and by keyword.", block=who, port=name)
+            raise DoubleDriveError(
+                "it is driven twice in one call, by position and by keyword. Give it once.", block=who, port=name
+            )
         given[name] = value
     missing = [name for name, port in inputs.items() if name not in given and port.default is None]
     if missing:

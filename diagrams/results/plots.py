@@ -92,7 +92,7 @@ def plot_signals(
 ) -> Figure:
     """Draw signals over time, one axis below the other; see `Run.plot`."""
     if not panels:
-        raise OptionError('found no signal to draw; expected names, such as run.plot("eta", "xi").')
+        raise OptionError('found no signal to draw; expected names. Give them: run.plot("eta", "xi").')
     if axes is not None:
         with style():
             own: list[Axes] = list(np.ravel(np.asarray(axes, dtype=object)))

@@ -326,10 +326,14 @@ class Recording:
     def __post_init__(self) -> None:
         if self.record is not None and not isinstance(self.record, Iterable):
             raise OptionError(
-                f"found record={self.record!r}; expected names of signals, such as record=['y'].", block=self.name
+                f"found record={self.record!r}; expected names of signals. Give a list, such as record=['y'].",
+                block=self.name,
             )
         if self.to is not None and not isinstance(self.to, str | os.PathLike):
-            raise OptionError(f"found to={self.to!r}; expected the path of a folder.", block=self.name)
+            raise OptionError(
+                f"found to={self.to!r}; expected the path of a folder. Give one, such as to='runs/first'.",
+                block=self.name,
+            )
 
     def stay_in_memory(self) -> None:
         """Let the next recorder keep its samples in memory: the run on disk stays."""
