@@ -268,7 +268,7 @@ def test_states_at_one_that_only_rounding_couples_do_not_make_a_loop_unstable(no
         (control.ss(0.5, 1, 1, 0, 0.1), {"delay": 0.5}, "delay of 0.5 samples"),
         (control.ss(-1, 1, 0, 2), {}, "the constant 2: no state is controllable and observable"),
         (control.ss(-1, 1, 1, -1), {}, "L = −1 at infinite frequency"),
-        ("L", {}, "found str, which python-control can.t turn into a state space"),
+        ("L", {}, r"loop: found 'L'; expected the loop at a wire. Give diagram\.linearize\(\)\.loop\('L'\)"),
     ],
 )
 def test_a_loop_that_has_no_margins_is_refused_with_a_next_step(loop, options, message):
