@@ -1,7 +1,7 @@
 """The block `Fmu` and its linear model."""
 
 from .derivation import Derivation, DerivativeMethod
-from .exchange_slopes import EquationSlopes, LocalEquations
+from .equation_slopes import EquationSlopes, LocalEquations
 from .fmu import Fmu, setup_of
 from .fmu_point import FmuLinearization, open_to_step, refuse_end, take_step
 from .known_models import linearize_fmu, step_gap

@@ -19,7 +19,7 @@ from ..archive import FmuVariable
 from ..calls import FmuInstance, FmuSetup, ModelExchangeInstance, is_smooth
 from .derivation import Derivation, DerivativeMethod
 from .difference_quotients import Column, differentiate
-from .exchange_slopes import EQUATIONS, EquationSlopes, LocalEquations, real_elements
+from .equation_slopes import EQUATIONS, EquationSlopes, LocalEquations, real_elements
 from .fmu_point import (
     FmuLinearization,
     FmuPoint,
