@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.blocks import OptionError
@@ -72,6 +72,7 @@ def test_a_number_that_leaves_something_out_can_still_fail():
     assert judge(number(40.0, findings=(KINK,)), Limit(45.0, OPEN))[0] is Verdict.FAILED
 
 
+@settings(deadline=None)  # a busy machine is no failure
 @given(
     st.floats(),
     st.floats(min_value=0.0),
