@@ -11,10 +11,11 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ...blocks.core import Finding, FmuError, Layout, Wanted
+from ...blocks.core import Finding, FmuError, Layout, OptionError, Wanted
 from ...fmus.fmu_block import (
     Derivation,
     EquationSlopes,
+    Fmu,
     FmuLinearization,
     LocalEquations,
     refuse_end,
@@ -27,7 +28,6 @@ from .left_out_effects import CoarseValues, InexactDerivatives, RefutedDerivativ
 
 if TYPE_CHECKING:
     from ...fmus.calls import ModelExchangeInstance
-    from ...fmus.fmu_block import Fmu
 
 
 KEPT = 2**20
@@ -146,12 +146,25 @@ def noise_of(evaluators: Evaluators | None) -> tuple[float, float]:
     return max((e.error for e in known), default=0.0), max((e.noise for e in known), default=0.0)
 
 
+def fmu_at(flat: FlatDiagram, path: str) -> Fmu:
+    """Return the FMU with a path. Raises `OptionError` where the block is another that a run steps or calls."""
+    block = flat.table.blocks[path]
+    if not isinstance(block, Fmu):
+        raise OptionError(
+            f"found a {type(block).__name__}, which a run steps or calls and is no FMU: it has no linear model; "
+            "expected an FMU, or a block with equations. Write it as a block with ``opaque = True``, whose equations "
+            "may be any Python, or measure the loop with diagram.frequency_response(…).",
+            block=path,
+        )
+    return block
+
+
 def load_evaluators(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, PointEvaluator]:
     """Return new evaluators of the FMUs in model exchange at an operating point, as `evaluators_at` does."""
     held, stack = _Held(), ExitStack()
     weakref.finalize(held, stack.close)
     for path in flat.in_model_exchange:
-        block = cast("Fmu", flat.table.blocks[path])
+        block = fmu_at(flat, path)
         evaluator = held[path] = PointEvaluator(flat, path)
         try:
             made = block.replace(start={**block.start, **settable(block, states_at(flat, at, path))})
@@ -168,7 +181,7 @@ def load_evaluators(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, Point
 
 def linearize_exchanged(flat: FlatDiagram, at: OperatingPoint, path: str) -> FmuLinearization:
     """Return the linear model of the equations of an FMU in model exchange at a point."""
-    block = cast("Fmu", flat.table.blocks[path])
+    block = fmu_at(flat, path)
     shapes = Layout.of(dict(flat.checked.traced[path].inputs))
     inputs = shapes.split(_inputs_at(flat, at, path))
     return block.linear_model(t=at.t, state=states_at(flat, at, path), inputs=inputs, interface="model_exchange")

@@ -71,8 +71,8 @@ def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> Opera
 
 def with_residual(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> OperatingPoint:
     """Return an operating point with its residual, the largest relative change of a state, and that state's name."""
-    from .exchanged import evaluators_at, pass_on
-    from .plant_models import fmu_at, plant_changes, plant_paths
+    from .exchanged import evaluators_at, fmu_at, pass_on
+    from .plant_models import plant_changes, plant_paths
 
     x, found, who = point.x, 0.0, ""
     rates = np.zeros(flat.width)

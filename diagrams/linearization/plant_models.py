@@ -19,7 +19,7 @@ from ..frequency import hold_inputs
 from ..results import OperatingPoint
 from ..wiring import join, stepped_blocks
 from .block_slopes import linearize_block
-from .exchanged import linearize_exchanged
+from .exchanged import fmu_at, linearize_exchanged
 from .identification import identify_step
 
 if TYPE_CHECKING:
@@ -79,11 +79,6 @@ class PlantModel:
 def plant_paths(flat: FlatDiagram) -> list[str]:
     """Return the paths of the FMUs."""
     return list(stepped_blocks(flat.table))
-
-
-def fmu_at(flat: FlatDiagram, path: str) -> Fmu:
-    """Return the FMU with a path."""
-    return cast("Fmu", flat.table.blocks[path])
 
 
 def plant_layout(blocks: Mapping[str, Block], points: Mapping[str, Any], offset: int = 0) -> StateLayout:

@@ -21,9 +21,9 @@ from ..wiring import Wire, join
 from .absorbed_shifts import ShiftedBlock
 from .delay_channels import delay_channels
 from .derivatives import LocalDerivatives, Numbers
-from .exchanged import noise_of
+from .exchanged import fmu_at, noise_of
 from .over_a_period import find_needed, own_states
-from .plant_models import PlantModel, fmu_at, join_matrices, linearize_equations, plant_entries, plant_point
+from .plant_models import PlantModel, join_matrices, linearize_equations, plant_entries, plant_point
 from .signal_paths import SignalPaths
 from .taps import Tap, find_signal, wire_entries
 from .tick_chain import Chain, Visit, period_of

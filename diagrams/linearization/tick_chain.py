@@ -27,13 +27,12 @@ from .delay_channels import delay_channels
 from .delayed_flow import DelayedFlow, DelayLine, find_steady_slopes
 from .derivatives import LocalDerivatives, Numbers
 from .derivatives_along import slope_of
-from .exchanged import noise_of
+from .exchanged import fmu_at, noise_of
 from .flow_model import differentiate_flow
 from .left_out_effects import EventWithinPeriod, UnusualStart
 from .plant_models import (
     EQUILIBRIUM,
     PlantModel,
-    fmu_at,
     inputs_before,
     join_matrices,
     plant_paths,

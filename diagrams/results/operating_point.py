@@ -65,9 +65,9 @@ def units_of(blocks: Mapping[str, Any], paths: Iterable[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in paths:
         block = blocks[path]
-        about = getattr(block, "description", None)
-        if about is None:
+        if not hasattr(block, "output_variables"):  # a user's block that is stepped, and no FMU
             continue
+        about = block.description
         variables = {name: about.find(name) for name in (*about.states, *about.discrete_states)}
         for name, variable in {**variables, **block.output_variables, **block.input_variables}.items():
             if variable.unit is not None:

@@ -113,6 +113,8 @@ def test_a_users_block_in_model_exchange_beside_an_fmu_in_co_simulation(cache):
     signals = ("a.position", "b.position")
     errors = [largest_error(diagram, two_masses_exactly, signals, step=h, coupling="iterated")[0] for h in STEPS[1:]]
     assert order_of(errors) == pytest.approx([2], abs=0.2)
+    with pytest.raises(OptionError, match="^b: found a Called, .* no FMU"):
+        diagram.linearize()
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.5])  # plain repetition diverges from 1 on

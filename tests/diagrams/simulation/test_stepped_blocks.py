@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Gain, Ramp
-from loopwright.diagrams import Diagram, check_block, subsystem
+from loopwright.diagrams import Diagram, OptionError, check_block, subsystem
 from loopwright.diagrams.wiring.structure import stepped_blocks
 from support.tanks import CALLS, Tank
 
@@ -77,3 +77,9 @@ def test_one_function_lists_it_and_a_drawing_shows_it_as_a_plant():
 
 def test_the_contract_runs_it_without_looking_for_equations():
     assert check_block(Tank(area=2.0))
+
+
+@pytest.mark.parametrize("ask", [Diagram.linearize, Diagram.trim, Diagram.operating_point])
+def test_it_has_no_linear_model_and_an_error_says_what_to_do(ask):
+    with pytest.raises(OptionError, match=r"^tank: found a Tank, .* no FMU: .*`opaque = True`.*frequency_response"):
+        ask(closed_loop())
