@@ -223,7 +223,7 @@ def diagram(spec, order=None, borders=True):
 
     def inside(frame, /, **signals):
         fill(frame, {int(k[1:]): s for k, s in signals.items()})
-        return {f"o{k}": blocks[k].y for k in sorted(within[frame])} if borders else None
+        return {f"o{k}": blocks[k].y for k in sorted(within[frame])} if borders else ()
 
     def fill(frame, given):
         """Call what stands in a frame, with the signals that its inputs give; return the calls."""
