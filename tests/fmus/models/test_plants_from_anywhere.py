@@ -4,6 +4,7 @@ Builds of both versions of FMI give the numbers of one model; the gantry that an
 equations gives those of the gantry.
 """
 
+import importlib.metadata
 import importlib.util
 import shutil
 import sys
@@ -103,9 +104,11 @@ def test_a_gantry_that_another_tool_has_exported(tmp_path, tool, letter):
 @pytest.mark.parametrize("tool", TOOLS)
 def test_such_an_export_has_its_binaries_whatever_was_loaded_here(tmp_path, monkeypatch, tool):
     """As an FMU of the tool leaves it that was loaded into this process: its own package, without binaries, is first."""
-    if (found := importlib.util.find_spec(tool)) is None:
+    if importlib.util.find_spec(tool) is None:
         pytest.skip(f"{tool} is not installed (extra: test)")
-    (package,) = found.submodule_search_locations
+    package = importlib.metadata.distribution(tool).locate_file(
+        tool
+    )  # an FMU that an earlier test has loaded may be first
     carried = tmp_path / "resources"
     shutil.copytree(package, carried / tool, ignore=shutil.ignore_patterns("binaries", "__pycache__"))
     monkeypatch.syspath_prepend(str(carried))
