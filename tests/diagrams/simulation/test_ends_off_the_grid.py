@@ -77,6 +77,7 @@ def test_an_fmu_steps_to_the_end():
     assert part["plant.position"][-1] == pytest.approx(middle, abs=1e-9)
 
 
+@pytest.mark.one_tier  # it counts calls
 @pytest.mark.parametrize("continuous", [False, True])
 @pytest.mark.parametrize("end", [0.53, 0.58])  # the last tick of the base before it: 0.5, and 0.55, where nothing acts
 def test_a_plant_waits_for_the_end_where_the_last_tick_is_none_of_its_own(continuous, end):
