@@ -12,7 +12,6 @@ import types
 import zipfile
 from contextlib import chdir, nullcontext, redirect_stdout
 from pathlib import Path
-from unittest.mock import patch
 from xml.etree import ElementTree as ET
 
 import matplotlib
@@ -40,7 +39,8 @@ def run_page(page, folder):
     """
     module = types.ModuleType("page")
     scope = vars(module)
-    with chdir(folder), patch.dict(sys.modules, page=module):  # blocks of a page are pickled by their module's name
+    with chdir(folder), pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "page", module)  # blocks of a page are pickled by their module's name
         for snippet in blocks_of_code((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")):
             exec(snippet, scope)
     plt.close("all")
