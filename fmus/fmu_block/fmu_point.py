@@ -121,6 +121,16 @@ class FmuPoint:
             )
         return Layout.of({v.name: v.shape for v in variables}).split(vector)
 
+    def check_states(self, step: str) -> None:
+        """Refuse a state that a step of co-simulation can't begin from; ``step`` is the next one in the error."""
+        for name in self.states:
+            if self.about.find(name).initial != "exact":
+                raise FmuError(
+                    "its state has no exact start value, and co-simulation allows to set it at the start only. " + step,
+                    block=self.setup.label,
+                    port=name,
+                )
+
     def initialize(self, instance: LoadedFmu, moved: Mapping[str, Any] = MappingProxyType({})) -> None:
         """Enter Initialization Mode at the point with some values moved; it sets those with an exact start value."""
         given = {n: v for n, v in {**self.given, **moved}.items() if self.about.find(n).initial == "exact"}

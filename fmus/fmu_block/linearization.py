@@ -234,15 +234,7 @@ def step_difference(
 ) -> FmuLinearization:
     """Linearize a communication step; see `Fmu.step_difference`."""
     point = FmuPoint(setup, t, state, inputs)
-    about = point.about
-    for name in point.states:
-        if about.find(name).initial != "exact":
-            raise FmuError(
-                "its state has no exact start value, and co-simulation allows to set it at the start only. Use "
-                "linear_model() through model exchange, or identify it from a run.",
-                block=setup.label,
-                port=name,
-            )
+    point.check_states("Use linear_model() through model exchange, or identify it from a run.")
     with initialize_to_step(point) as instance:
         return _linearize_step(point, instance, h, relative_step)
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError
 from .fmu import Fmu, setup_of
 from .fmu_point import FmuPoint, initialize_to_step, step_from
 
@@ -24,14 +23,7 @@ def take_shifted_steps(
     names = [*point.states, *point.inputs]
     layout = about.layout(names)
     moved = {n for n in names if any(np.any(np.concatenate(shift)[layout.slices[n]]) for shift in shifts)}
-    for name in point.states:
-        if about.find(name).initial != "exact":
-            raise FmuError(
-                "its state has no exact start value, so co-simulation can't set it to another one. Judge it by its "
-                "linear model.",
-                block=block.label,
-                port=name,
-            )
+    point.check_states("Judge it by its linear model.")
     with initialize_to_step(point) as instance:
         at = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
 
